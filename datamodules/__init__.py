@@ -1,0 +1,1 @@
+"""LightningDataModules: where samples come from."""
