@@ -1,0 +1,1 @@
+"""Lightning and Hydra callbacks: drawing, progress, files beside a run."""

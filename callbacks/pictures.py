@@ -1,0 +1,205 @@
+"""Pictures of predicted joints: of fixed validation samples while training, of the extremes after a test."""
+
+import warnings
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+import torch
+from lightning.pytorch import Callback, LightningModule, Trainer
+from lightning.pytorch.loggers import WandbLogger
+from torch import Tensor
+
+from ljn.batch import Batch
+from ljn.body.skeleton import BONES
+from ljn.metrics.functional import mpjpe
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+_TRUE, _PREDICTED, _CLOUD = "#1f5fd6", "#d62728", "#b9bec6"
+
+
+class Sample(NamedTuple):
+    """What is drawn of a sample; camera frame, metres.
+
+    Attributes:
+        points: `(N, 3)`.
+        joints: `(24, 3)`, the truth.
+        pred_joints: `(24, 3)`.
+        title: Text above it.
+    """
+
+    points: np.ndarray
+    joints: np.ndarray
+    pred_joints: np.ndarray
+    title: str
+
+
+class JointPictures(Callback):
+    """Draws clouds with true (blue) and predicted (red) skeletons, from the front and from the side.
+
+    Files go below `directory`, and to W&B where it is among the loggers. A picture that cannot be drawn warns
+    once and never stops a run.
+
+    Args:
+        directory: Where pictures go.
+        num_samples: Validation samples (the first ones) and test samples of each kind to draw.
+        every_n_epochs: Epochs between two validation pictures.
+    """
+
+    def __init__(self, directory: str | Path, num_samples: int = 4, every_n_epochs: int = 5) -> None:
+        self.directory = Path(directory)
+        self.num_samples = num_samples
+        self.every_n_epochs = every_n_epochs
+        self._has_warned = False
+        self._validation: list[Sample] = []
+        self._errors: list[Tensor] = []
+        self._extremes: dict[int, Sample] = {}
+        self._test_joints: list[tuple[Tensor, Tensor]] = []
+
+    def on_validation_batch_end(
+        self,
+        trainer: Trainer,
+        pl_module: LightningModule,
+        outputs: Any,
+        batch: Batch,
+        batch_idx: int,
+        dataloader_idx: int = 0,
+    ) -> None:
+        """Keep the first samples."""
+        if not self._is_due(trainer):
+            return
+        for row in range(min(self.num_samples - len(self._validation), len(batch["joints"]))):
+            error = float(mpjpe(outputs["pred_joints"][row], batch["joints"][row]))
+            self._validation.append(
+                _sample(batch, outputs["pred_joints"], row, f"sample {int(batch['sample_id'][row])}: {error:.0f} mm")
+            )
+
+    def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Draw them."""
+        samples, self._validation = self._validation, []
+        if samples:
+            self._save(trainer, samples, "val/samples", f"val_epoch_{trainer.current_epoch + 1:03d}")
+
+    def on_test_batch_end(
+        self,
+        trainer: Trainer,
+        pl_module: LightningModule,
+        outputs: Any,
+        batch: Batch,
+        batch_idx: int,
+        dataloader_idx: int = 0,
+    ) -> None:
+        """Keep the joints of every sample."""
+        self._test_joints.append((outputs["pred_joints"].detach().cpu(), batch["joints"].cpu()))
+
+    def on_test_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Draw the best, the median and the worst samples on a page."""
+        kept, self._test_joints = self._test_joints, []
+        pred_joints = torch.cat([pred for pred, _ in kept])
+        errors = mpjpe(pred_joints, torch.cat([joints for _, joints in kept]))
+        order = errors.nan_to_num(nan=torch.inf).argsort().tolist()
+        number = min(self.num_samples, len(order))
+        middle = (len(order) - number) // 2
+        kinds = {"best": order[:number], "median": order[middle : middle + number], "worst": order[-number:]}
+        batch_size = len(kept[0][0])
+        needed = {index // batch_size for indices in kinds.values() for index in indices}
+        points: dict[int, Tensor] = {}
+        for batch_idx, batch in enumerate(trainer.test_dataloaders):
+            if batch_idx in needed:
+                points |= {batch_idx * batch_size + row: value for row, value in enumerate(batch["points"])}
+            if batch_idx >= max(needed):
+                break
+        joints = torch.cat([joints for _, joints in kept])
+        samples = [
+            Sample(
+                points[index][:, :3].numpy(),
+                joints[index].numpy(),
+                pred_joints[index].numpy(),
+                f"{kind}: {float(errors[index]):.0f} mm",
+            )
+            for kind, indices in kinds.items()
+            for index in indices
+        ]
+        self._save(trainer, samples, "test/extremes", "test_best_median_worst")
+
+    def _is_due(self, trainer: Trainer) -> bool:
+        epoch = trainer.current_epoch + 1
+        return epoch % self.every_n_epochs == 0 or epoch in (1, trainer.max_epochs)
+
+    def _save(self, trainer: Trainer, samples: list[Sample], key: str, name: str) -> None:
+        if not trainer.is_global_zero:
+            return
+        try:
+            figure = draw_samples(samples, self.num_samples)
+            self.directory.mkdir(parents=True, exist_ok=True)
+            path = self.directory / f"{name}.png"
+            figure.savefig(path)
+            for logger in trainer.loggers:
+                if isinstance(logger, WandbLogger):
+                    logger.log_image(key, [str(path)])
+        except Exception as error:  # whatever goes wrong in drawing, training goes on
+            if not self._has_warned:
+                warnings.warn(f"no pictures: {type(error).__name__}: {error}", stacklevel=2)
+            self._has_warned = True
+
+
+def _sample(batch: Batch, pred_joints: Tensor, row: int, title: str) -> Sample:
+    tensors = (batch["points"][row, :, :3], batch["joints"][row], pred_joints[row])
+    return Sample(*(tensor.detach().cpu().numpy() for tensor in tensors), title)
+
+
+def draw_samples(samples: list[Sample], num_columns: int) -> "Figure":
+    """A page of samples, each from the front (the camera's view) and from the side.
+
+    Args:
+        samples: What to draw, in reading order.
+        num_columns: Samples in a row.
+
+    Returns:
+        A matplotlib figure, made without a display.
+    """
+    # Not through pyplot: its figures belong to a global state and, on some machines, to a screen.
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    num_rows = -(-len(samples) // num_columns)
+    figure = Figure(figsize=(3.2 * num_columns, 3.4 * num_rows), dpi=100, layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(num_rows, 2 * num_columns, squeeze=False)
+    for axis in axes.flat:
+        axis.set_axis_off()
+    for number, sample in enumerate(samples):
+        row, column = divmod(number, num_columns)
+        front, side = axes[row, 2 * column], axes[row, 2 * column + 1]
+        _draw_view(front, sample, horizontal=0)
+        _draw_view(side, sample, horizontal=2)
+        front.set_title(sample.title, fontsize=9, loc="left")
+    figure.legend(
+        handles=[
+            axes[0, 0].plot([], [], color=_TRUE, lw=2, label="true")[0],
+            axes[0, 0].plot([], [], color=_PREDICTED, lw=2, label="predicted")[0],
+        ],
+        loc="outside lower center",
+        ncols=2,
+        fontsize=9,
+        frameon=False,
+    )
+    return figure
+
+
+def _draw_view(axis: "Axes", sample: Sample, horizontal: int) -> None:
+    """One view: `horizontal` is the camera axis that goes to the right (0 from the front, 2 from the side)."""
+    axis.scatter(sample.points[:, horizontal], sample.points[:, 1], s=0.6, c=_CLOUD, linewidths=0)
+    for joints, colour in ((sample.joints, _TRUE), (sample.pred_joints, _PREDICTED)):
+        for parent, joint in BONES:
+            ends = joints[[parent, joint]]
+            axis.plot(ends[:, horizontal], ends[:, 1], color=colour, lw=1.6, solid_capstyle="round")
+    everything = np.concatenate([sample.points, sample.joints, sample.pred_joints])
+    centre = (everything.min(0) + everything.max(0)) / 2
+    half = 0.52 * float(np.ptp(everything, axis=0).max())
+    axis.set_xlim(centre[horizontal] - half, centre[horizontal] + half)
+    axis.set_ylim(centre[1] + half, centre[1] - half)  # y points down
+    axis.set_aspect("equal")

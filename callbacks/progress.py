@@ -1,0 +1,62 @@
+"""Progress on the terminal: loss, validation error and speed."""
+
+import sys
+import time
+from typing import Any
+
+from lightning.pytorch import LightningModule, Trainer
+from lightning.pytorch.callbacks import TQDMProgressBar
+
+
+class Progress(TQDMProgressBar):
+    """Bars on a terminal, and everywhere one line for each epoch.
+
+    Args:
+        metric: The validation metric to show.
+        unit: Its unit.
+        refresh_rate: Batches between two refreshes of a bar.
+    """
+
+    def __init__(self, metric: str = "val/mpjpe", unit: str = "mm", refresh_rate: int = 10) -> None:
+        super().__init__(refresh_rate=refresh_rate if sys.stdout.isatty() else 0)
+        self.metric = metric
+        self.unit = unit
+        self._samples = 0
+        self._started = 0.0
+        self._training_s = 0.0
+
+    def on_train_epoch_start(self, trainer: Trainer, *args: Any) -> None:
+        """Start the clock."""
+        super().on_train_epoch_start(trainer, *args)
+        self._samples, self._training_s, self._started = 0, 0.0, time.monotonic()
+
+    def on_train_batch_end(
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        """Count the samples."""
+        self._samples += len(next(iter(batch.values()))) * trainer.world_size
+        self._training_s = time.monotonic() - self._started
+        super().on_train_batch_end(trainer, pl_module, outputs, batch, batch_idx)
+
+    def get_metrics(self, trainer: Trainer, pl_module: LightningModule) -> dict[str, Any]:
+        """What the bar shows beside its own counts."""
+        shown = super().get_metrics(trainer, pl_module)
+        shown.pop("v_num", None)
+        if self.metric in trainer.callback_metrics:
+            shown[self.metric] = f"{float(trainer.callback_metrics[self.metric]):.1f} {self.unit}"
+        if self._training_s:
+            shown["samples/s"] = round(self._samples / self._training_s)
+        return shown
+
+    def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Print the epoch's line."""
+        super().on_train_epoch_end(trainer, pl_module)
+        metrics = trainer.callback_metrics
+        parts = [f"epoch {trainer.current_epoch + 1}/{trainer.max_epochs}"]
+        if "train/loss" in metrics:
+            parts.append(f"loss {float(metrics['train/loss']):.4f}")
+        if self.metric in metrics:
+            parts.append(f"{self.metric} {float(metrics[self.metric]):.1f} {self.unit}")
+        if self._training_s:
+            parts.append(f"{self._samples / self._training_s:.0f} samples/s")
+        trainer.print("  ".join(parts), flush=True)

@@ -1,0 +1,54 @@
+"""The errors of every test sample on disk: for paired tests and worst cases."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from lightning.pytorch import Callback, LightningModule, Trainer
+from torch import Tensor
+
+from ljn.batch import Batch
+from ljn.metrics.functional import joint_errors_mm
+
+
+class SampleErrors(Callback):
+    """Writes `test_errors.npz` after a test.
+
+    It holds, a row a sample: `sample_id` `(S,)`, `errors_mm` and `initial_errors_mm` `(S, 24)`, and `joints`,
+    `pred_joints` and `initial_joints` `(S, 24, 3)` in metres, camera frame.
+
+    Args:
+        directory: Where the file goes.
+    """
+
+    def __init__(self, directory: str | Path) -> None:
+        self.path = Path(directory) / "test_errors.npz"
+        self._batches: list[dict[str, Tensor]] = []
+
+    def on_test_batch_end(
+        self,
+        trainer: Trainer,
+        pl_module: LightningModule,
+        outputs: Any,
+        batch: Batch,
+        batch_idx: int,
+        dataloader_idx: int = 0,
+    ) -> None:
+        """Keep a batch's predictions."""
+        kept = {
+            "sample_id": batch["sample_id"],
+            "joints": batch["joints"],
+            "pred_joints": outputs["pred_joints"],
+            "initial_joints": batch["initial_joints"],
+        }
+        self._batches.append({name: value.detach().cpu() for name, value in kept.items()})
+
+    def on_test_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Write the file."""
+        arrays = {name: torch.cat([batch[name] for batch in self._batches]) for name in self._batches[0]}
+        self._batches = []
+        arrays["errors_mm"] = joint_errors_mm(arrays["pred_joints"], arrays["joints"]).float()
+        arrays["initial_errors_mm"] = joint_errors_mm(arrays["initial_joints"], arrays["joints"]).float()
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        np.savez_compressed(self.path, **{name: value.numpy() for name, value in arrays.items()})  # type: ignore[arg-type]

@@ -1,0 +1,76 @@
+"""Sources of poses. Each yields `PoseRecords` for a split; how they are rendered is not its concern."""
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from ljn.body.skeleton import NUM_JOINTS
+
+SPLITS = ("train", "val", "test")
+
+
+@dataclass(frozen=True)
+class PoseRecords:
+    """A table of poses and shapes, a row each.
+
+    Attributes:
+        pose: `(R, 72)` float32 axis-angle, radians; the first three place the body in the body world (z up,
+            x forward), heading included where `has_heading`.
+        betas: `(R, 10)` float32 shape coefficients.
+        gender: `(R,)` int64, codes of `ljn.body.GENDERS`.
+        sequence: `(R,)` str, the clip that the pose came from.
+        frame: `(R,)` int64, the frame in that clip.
+        has_heading: Whether the first rotation still holds the heading that was recorded.
+    """
+
+    pose: np.ndarray
+    betas: np.ndarray
+    gender: np.ndarray
+    sequence: np.ndarray
+    frame: np.ndarray
+    has_heading: bool
+
+    def __post_init__(self) -> None:
+        shapes = {"pose": (3 * NUM_JOINTS,), "betas": (10,), "gender": (), "sequence": (), "frame": ()}
+        for name, tail in shapes.items():
+            got = getattr(self, name).shape
+            if got != (len(self.pose), *tail):
+                raise ValueError(f"{name}: expected shape {('R', *tail)} with R = {len(self.pose)}, got {got}")
+        for name in ("pose", "betas"):
+            bad = np.flatnonzero(~np.isfinite(getattr(self, name)).all(-1))
+            if len(bad):
+                raise ValueError(
+                    f"{name}: NaN or infinite values in {len(bad)} of {len(self)} records, the first in "
+                    f"record {bad[0]} (sequence '{self.sequence[bad[0]]}'); drop or repair them"
+                )
+
+    def __len__(self) -> int:
+        return len(self.pose)
+
+
+class PoseSource(Protocol):
+    """What a source of poses offers."""
+
+    @property
+    def name(self) -> str:
+        """Name for records and reports."""
+        ...
+
+    @property
+    def fingerprint(self) -> str:
+        """Hash of all that its records depend on beside the seed: files, splits, settings."""
+        ...
+
+    @property
+    def licence(self) -> str:
+        """One line on where the poses come from and what may be done with them."""
+        ...
+
+    def check(self) -> None:
+        """Raise `FileNotFoundError` or `ValueError` where its files are missing or damaged."""
+        ...
+
+    def records(self, split: str, num_records: int, seed: int) -> PoseRecords:
+        """`num_records` records of a split (one of `SPLITS`); the same ones for the same seed."""
+        ...

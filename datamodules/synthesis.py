@@ -1,0 +1,188 @@
+"""From a pose record to a training sample: mesh, depth image, noisy cloud with normals, initial joints."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from datamodules.placement import HEADINGS, draw_heading, place
+from datamodules.sources import PoseRecords
+from ljn.batch import Batch
+from ljn.body import SMPL, BodyModel
+from ljn.cloud.keypoints import lift_keypoints
+from ljn.cloud.normals import NormalEstimator, get_normal_estimator
+from ljn.cloud.sampling import add_depth_noise, sample_cloud
+from ljn.geometry.camera import Camera, project
+from ljn.geometry.rotations import CAMERA_FROM_BODY, rotation_about, rotmat_to_rotvec, rotvec_to_rotmat
+from ljn.render import RENDERERS, Renderer, get_renderer
+
+# Each purpose has a generator of its own: changing one (the number of points, a sigma) leaves the others' draws.
+_PLACEMENT, _DEPTH_NOISE, _SAMPLING, _KEYPOINTS = range(4)
+
+
+@dataclass(frozen=True)
+class SynthesisSettings:
+    """How a pose becomes a sample.
+
+    Attributes:
+        camera: The depth camera.
+        num_points: Points in a cloud.
+        heading: `histogram`, `uniform` or `source`; see `draw_heading`.
+        distance_m: Range of the depth of the body's centre, metres.
+        margin_px: Clear border around the body, pixels.
+        depth_noise_m: Standard deviation of the depth noise, metres.
+        keypoint_noise_px: Standard deviation of the keypoints' noise, pixels.
+        renderer: A name that `ljn.render.get_renderer` knows.
+        normals: `window` or `open3d`.
+    """
+
+    camera: Camera
+    num_points: int
+    heading: str = "histogram"
+    distance_m: tuple[float, float] = (1.5, 3.0)
+    margin_px: float = 8.0
+    depth_noise_m: float = 0.001
+    keypoint_noise_px: float = 10.0
+    renderer: str = "auto"
+    normals: str = "window"
+
+    def __post_init__(self) -> None:
+        if self.num_points < 1:
+            raise ValueError(f"num_points: expected at least 1, got {self.num_points}")
+        if self.heading not in HEADINGS:
+            raise ValueError(f"heading: expected one of {', '.join(HEADINGS)}, got '{self.heading}'")
+        if self.renderer not in RENDERERS:
+            raise ValueError(f"renderer: expected one of {', '.join(RENDERERS)}, got '{self.renderer}'")
+        if not 0 < self.distance_m[0] <= self.distance_m[1]:
+            raise ValueError(f"distance_m: expected 0 < nearest <= farthest, got {self.distance_m}")
+        for name in ("margin_px", "depth_noise_m", "keypoint_noise_px"):
+            if getattr(self, name) < 0:
+                raise ValueError(f"{name}: expected 0 or more, got {getattr(self, name)}")
+
+
+class DepthSynthesizer:
+    """Renders samples of a table of records; cheap to build and to send to a worker process.
+
+    The body layer, the renderer and the normal estimator are made on first use, in the process that uses them.
+
+    Args:
+        records: The poses and shapes.
+        body: The body.
+        settings: See `SynthesisSettings`.
+        seed_key: What the random draws hang on, beside a sample's epoch and index: a seed and a split number.
+        dtype: Precision of the body; float64 makes fixed sets agree across machines.
+    """
+
+    def __init__(
+        self,
+        records: PoseRecords,
+        body: BodyModel,
+        settings: SynthesisSettings,
+        seed_key: tuple[int, int],
+        dtype: torch.dtype = torch.float32,
+    ) -> None:
+        if settings.heading == "source" and not records.has_heading:
+            raise ValueError("heading: these poses carry no heading of their own; use 'histogram' or 'uniform'")
+        self.records = records
+        self.body = body
+        self.settings = settings
+        self.seed_key = seed_key
+        self.dtype = dtype
+
+    def __getstate__(self) -> dict[str, Any]:
+        lazy = ("_smpl", "_renderer", "_normals")
+        return {name: value for name, value in self.__dict__.items() if name not in lazy}
+
+    @cached_property
+    def _smpl(self) -> SMPL:
+        return SMPL(self.body).to(self.dtype)
+
+    @cached_property
+    def _renderer(self) -> Renderer:
+        return get_renderer(self.settings.renderer)
+
+    @cached_property
+    def _normals(self) -> NormalEstimator:
+        return get_normal_estimator(self.settings.normals)
+
+    def _rng(self, epoch: int, index: int, purpose: int) -> np.random.Generator:
+        return np.random.default_rng([*self.seed_key, epoch, index, purpose])
+
+    @torch.no_grad()
+    def batch(self, keys: Sequence[tuple[int, int]]) -> Batch:
+        """The samples of `keys`, each an epoch and a record's index; every sample depends on its key alone."""
+        settings, camera = self.settings, self.settings.camera
+        placement = [self._rng(epoch, index, _PLACEMENT) for epoch, index in keys]
+        rows = [index for _, index in keys]
+        pose = torch.from_numpy(self.records.pose[rows]).to(self.dtype)
+        heading = torch.tensor([draw_heading(settings.heading, rng) for rng in placement], dtype=self.dtype)
+        root = rotation_about("z", heading) @ rotvec_to_rotmat(pose[:, :3])
+        pose = torch.cat([rotmat_to_rotvec(root), pose[:, 3:]], -1)
+        betas = torch.from_numpy(self.records.betas[rows]).to(self.dtype)
+
+        vertices, joints = self._smpl(pose, betas)
+        cam_from_body = CAMERA_FROM_BODY.to(self.dtype)
+        vertices, joints = vertices @ cam_from_body.T, joints @ cam_from_body.T
+        transl = torch.from_numpy(
+            np.stack(
+                [
+                    place(mesh, camera, rng.random(3), settings.distance_m, settings.margin_px)
+                    for mesh, rng in zip(vertices.numpy(), placement)
+                ]
+            )
+        ).to(self.dtype)
+        vertices, joints = vertices + transl[:, None], joints + transl[:, None]
+        intrinsics = camera.intrinsics(self.dtype).expand(len(keys), 4)
+        keypoints = project(joints, intrinsics).float()
+
+        depth = self._renderer(vertices, self._smpl.faces, camera).numpy()
+        points = np.empty((len(keys), settings.num_points, 6), np.float32)
+        noisy_keypoints = np.empty((len(keys), *keypoints.shape[1:]), np.float32)
+        initial_joints = np.empty((len(keys), *joints.shape[1:]), np.float32)
+        for i, (epoch, index) in enumerate(keys):
+            noisy = add_depth_noise(depth[i], settings.depth_noise_m, self._rng(epoch, index, _DEPTH_NOISE))
+            cloud = sample_cloud(noisy, camera, settings.num_points, self._rng(epoch, index, _SAMPLING))
+            points[i, :, :3] = cloud.points
+            points[i, :, 3:] = self._normals(cloud, noisy, camera)
+            noisy_keypoints[i] = add_keypoint_noise(
+                keypoints[i].numpy(), settings.keypoint_noise_px, camera, self._rng(epoch, index, _KEYPOINTS)
+            )
+            initial_joints[i] = lift_keypoints(noisy_keypoints[i], noisy, camera)
+        return Batch(
+            points=torch.from_numpy(points),
+            keypoints_2d=keypoints,
+            noisy_keypoints_2d=torch.from_numpy(noisy_keypoints),
+            initial_joints=torch.from_numpy(initial_joints),
+            joints=joints.float(),
+            pose=pose.float(),
+            betas=betas.float(),
+            gender=torch.from_numpy(self.records.gender[rows]),
+            camera=intrinsics.float(),
+            sample_id=torch.tensor(rows),
+        )
+
+
+def add_keypoint_noise(
+    keypoints: np.ndarray, noise_px: float, camera: Camera | None, rng: np.random.Generator
+) -> np.ndarray:
+    """2D keypoints as a detector might give them.
+
+    Args:
+        keypoints: `(K, 2)`, pixels.
+        noise_px: Standard deviation of the Gaussian noise on u and on v, pixels.
+        camera: Its image clips the result; None does not clip.
+        rng: Source of the draws; they do not depend on `noise_px`.
+    """
+    noisy = keypoints + noise_px * rng.standard_normal(keypoints.shape)
+    if camera is not None:
+        noisy = noisy.clip(0, [camera.width - 1, camera.height - 1])
+    return noisy.astype(np.float32)
+
+
+def concatenate(batches: Sequence[Batch]) -> dict[str, Tensor]:
+    """Batches joined along their first dimension."""
+    return {name: torch.cat([batch[name] for batch in batches]) for name in Batch.__annotations__}  # type: ignore[literal-required]

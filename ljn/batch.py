@@ -1,0 +1,33 @@
+"""The contract between data and models: what a batch holds."""
+
+from typing import TypedDict
+
+from torch import Tensor
+
+
+class Batch(TypedDict):
+    """A batch of samples; camera frame, metres and pixels.
+
+    Keys:
+        points: `(B, N, 6)` float32: position in metres and unit normal of each point, in random order.
+        keypoints_2d: `(B, 24, 2)`, true joints projected, pixels.
+        noisy_keypoints_2d: `(B, 24, 2)`, keypoints with noise, clipped to the image.
+        initial_joints: `(B, 24, 3)`, noisy keypoints lifted with the depth image, metres.
+        joints: `(B, 24, 3)`, true joints, metres.
+        pose: `(B, 72)`, axis-angle in the body world, heading included, radians.
+        betas: `(B, 10)`, shape coefficients.
+        gender: `(B,)` int64, codes of `ljn.body.GENDERS`.
+        camera: `(B, 4)`: fx, fy, cx, cy, pixels.
+        sample_id: `(B,)` int64, the record's number in its split.
+    """
+
+    points: Tensor
+    keypoints_2d: Tensor
+    noisy_keypoints_2d: Tensor
+    initial_joints: Tensor
+    joints: Tensor
+    pose: Tensor
+    betas: Tensor
+    gender: Tensor
+    camera: Tensor
+    sample_id: Tensor

@@ -1,0 +1,70 @@
+"""Pinhole cameras: projection and back-projection (the Pi of Eq. 3.4 and its inverse)."""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera without distortion; pixel centres are at integer coordinates.
+
+    Attributes:
+        fx: Focal length in x, pixels.
+        fy: Focal length in y, pixels.
+        cx: Principal point in x, pixels.
+        cy: Principal point in y, pixels.
+        width: Image width, pixels.
+        height: Image height, pixels.
+    """
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    width: int
+    height: int
+
+    def __post_init__(self) -> None:
+        if min(self.fx, self.fy, self.width, self.height) <= 0:
+            raise ValueError(f"camera: focal lengths and image size must be positive, got {self}")
+        if not (0 <= self.cx < self.width and 0 <= self.cy < self.height):
+            raise ValueError(
+                f"camera: the principal point ({self.cx}, {self.cy}) lies outside the image of "
+                f"{self.width} x {self.height} (width x height) pixels; are width and height, or cx and cy, swapped?"
+            )
+
+    def intrinsics(self, dtype: torch.dtype = torch.float32) -> Tensor:
+        """`(4,)`: fx, fy, cx, cy in pixels, the form in which a batch carries its cameras."""
+        return torch.tensor([self.fx, self.fy, self.cx, self.cy], dtype=dtype)
+
+
+def project(points: Tensor, intrinsics: Tensor) -> Tensor:
+    """Pixel coordinates of points in front of the camera.
+
+    Args:
+        points: `(..., N, 3)`, metres, camera frame, positive depth.
+        intrinsics: `(..., 4)`: fx, fy, cx, cy, pixels.
+
+    Returns:
+        `(..., N, 2)`: u to the right, v down, pixels.
+    """
+    focal, centre = intrinsics[..., None, :2], intrinsics[..., None, 2:]
+    return points[..., :2] / points[..., 2:] * focal + centre
+
+
+def back_project(pixels: Tensor, depth: Tensor, intrinsics: Tensor) -> Tensor:
+    """Points in space at given pixels and depths; the inverse of `project`.
+
+    Args:
+        pixels: `(..., N, 2)`, pixels.
+        depth: `(..., N)`, metres along the optical axis (planar depth, not the ray's length).
+        intrinsics: `(..., 4)`: fx, fy, cx, cy, pixels.
+
+    Returns:
+        `(..., N, 3)`, metres, camera frame.
+    """
+    focal, centre = intrinsics[..., None, :2], intrinsics[..., None, 2:]
+    depth = depth[..., None]
+    return torch.cat([(pixels - centre) / focal * depth, depth], -1)

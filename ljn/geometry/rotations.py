@@ -1,0 +1,126 @@
+"""Rotations as vectors and matrices, and the one place where body, SMPL and camera axes meet."""
+
+import torch
+from torch import Tensor
+
+BODY_TO_OPENGL = torch.tensor([[0, 1, 0], [0, 0, 1], [1, 0, 0]], dtype=torch.float64)
+"""R of Eq. 3.5, (3, 3): body world (x forward, y left, z up) to OpenGL's camera axes (x right, y up,
+looking along -z). SMPL's own rest frame (x to the body's left, y up, z forward) has these axes too."""
+
+CAMERA_FROM_BODY = torch.tensor([[0, 1, 0], [0, 0, -1], [-1, 0, 0]], dtype=torch.float64)
+"""Eq. 3.5 with OpenCV's camera axes (x right, y down, z forward), (3, 3): `BODY_TO_OPENGL` with its y and
+z turned round. A body that faces along +x looks into the camera."""
+
+_SMALL_SQUARE = 1e-5
+"""Below this squared angle (or squared sine of half of it) Taylor series are exact to float64 rounding."""
+
+
+def rotvec_to_rotmat(rotvec: Tensor) -> Tensor:
+    """Rotation matrices of rotation vectors: Rodrigues' formula, smooth everywhere, also at zero.
+
+    Args:
+        rotvec: `(..., 3)`, axis times angle, radians.
+
+    Returns:
+        `(..., 3, 3)`, acting on column vectors.
+    """
+    _check_shape("rotvec", rotvec, (3,))
+    square = (rotvec * rotvec).sum(-1)[..., None, None]  # (..., 1, 1)
+    is_small = square < _SMALL_SQUARE
+    # The branch not taken must stay finite as well: `where` multiplies its gradient by zero.
+    angle = torch.where(is_small, torch.ones_like(square), square).sqrt()
+    sine = torch.where(is_small, 1 - square / 6 + square**2 / 120, angle.sin() / angle)
+    versine = torch.where(is_small, 0.5 - square / 24 + square**2 / 720, 2 * ((angle / 2).sin() / angle) ** 2)
+
+    x, y, z = rotvec.unbind(-1)
+    zero = torch.zeros_like(x)
+    cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], -1).unflatten(-1, (3, 3))
+    outer = rotvec[..., :, None] * rotvec[..., None, :]
+    eye = torch.eye(3, dtype=rotvec.dtype, device=rotvec.device)
+    return (1 - versine * square) * eye + sine * cross + versine * outer
+
+
+def rotmat_to_rotvec(rotmat: Tensor) -> Tensor:
+    """Rotation vectors of rotation matrices, through quaternions; safe at the identity and half turns.
+
+    Args:
+        rotmat: `(..., 3, 3)` rotation matrices.
+
+    Returns:
+        `(..., 3)`, radians, of length at most pi. At a half turn either of the two signs may come.
+    """
+    _check_shape("rotmat", rotmat, (3, 3))
+    m00, m01, m02, m10, m11, m12, m20, m21, m22 = rotmat.flatten(-2).unbind(-1)
+    wx, wy, wz = m21 - m12, m02 - m20, m10 - m01
+    xy, xz, yz = m10 + m01, m02 + m20, m12 + m21
+    squares = torch.stack(
+        [1 + m00 + m11 + m22, 1 + m00 - m11 - m22, 1 - m00 + m11 - m22, 1 - m00 - m11 + m22], -1
+    )
+    ww, xx, yy, zz = squares.unbind(-1)
+    # 4 q q^T: each row is a multiple of q; the row of the largest component is never near zero.
+    products = torch.stack([ww, wx, wy, wz, wx, xx, xy, xz, wy, xy, yy, yz, wz, xz, yz, zz], -1)
+    largest = squares.argmax(-1)[..., None, None].expand(*squares.shape[:-1], 1, 4)
+    quaternion = products.unflatten(-1, (4, 4)).gather(-2, largest).squeeze(-2)
+    quaternion = quaternion / quaternion.norm(dim=-1, keepdim=True)
+    quaternion = torch.where(quaternion[..., :1] < 0, -quaternion, quaternion)
+
+    real, imaginary = quaternion.split([1, 3], dim=-1)
+    square = (imaginary * imaginary).sum(-1, keepdim=True)
+    is_small = square < _SMALL_SQUARE
+    sine = torch.where(is_small, torch.ones_like(square), square).sqrt()
+    scale = torch.where(is_small, 2 + square / 3 + 3 * square**2 / 20, 2 * torch.atan2(sine, real) / sine)
+    return scale * imaginary
+
+
+def rotation_about(axis: str, angle: Tensor) -> Tensor:
+    """Rotation matrices about a coordinate axis.
+
+    Args:
+        axis: "x", "y" or "z".
+        angle: `(...)`, radians, counter-clockwise seen from the axis' tip.
+
+    Returns:
+        `(..., 3, 3)`.
+    """
+    if axis not in ("x", "y", "z"):
+        raise ValueError(f"axis: expected 'x', 'y' or 'z', got {axis!r}")
+    unit = torch.eye(3, dtype=angle.dtype, device=angle.device)["xyz".index(axis)]
+    return rotvec_to_rotmat(angle[..., None] * unit)
+
+
+def smpl_pose_to_body_world(pose: Tensor) -> Tensor:
+    """A pose that stands in SMPL's own axes (y up, z forward), turned into body world (z up, x forward).
+
+    theta_0 <- log(R^T exp(theta_0)) with R of Eq. 3.5; the other joints are relative and stay.
+
+    Args:
+        pose: `(..., 72)`, axis-angle, radians, mapping SMPL's rest frame into SMPL's axes.
+
+    Returns:
+        `(..., 72)`, mapping SMPL's rest frame into body world.
+    """
+    return _turn_root(BODY_TO_OPENGL.T, pose)
+
+
+def body_world_pose_to_smpl(pose: Tensor) -> Tensor:
+    """A body-world pose turned into SMPL's own axes: the inverse of `smpl_pose_to_body_world`.
+
+    Args:
+        pose: `(..., 72)`, axis-angle, radians, mapping SMPL's rest frame into body world.
+
+    Returns:
+        `(..., 72)`, mapping SMPL's rest frame into SMPL's axes (y up, z forward).
+    """
+    return _turn_root(BODY_TO_OPENGL, pose)
+
+
+def _turn_root(rotmat: Tensor, pose: Tensor) -> Tensor:
+    _check_shape("pose", pose, (72,))
+    root, others = pose.split([3, 69], dim=-1)
+    return torch.cat([rotmat_to_rotvec(rotmat.to(pose) @ rotvec_to_rotmat(root)), others], dim=-1)
+
+
+def _check_shape(name: str, value: Tensor, last: tuple[int, ...]) -> None:
+    if value.shape[-len(last) :] != last:
+        expected = ", ".join(["...", *map(str, last)])
+        raise ValueError(f"{name}: expected shape ({expected}), got {tuple(value.shape)}")

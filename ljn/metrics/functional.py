@@ -1,0 +1,132 @@
+"""Functional forms of the metrics: one value for each sample, in float64.
+
+Joints come in metres and errors go out in millimetres, percentages in 0-100. NaN in gives NaN out for that
+sample, in PCKh too, where a comparison with NaN would count as an ordinary miss.
+"""
+
+from torch import Tensor
+
+from ljn.body.skeleton import HEAD_BONE, NUM_JOINTS, ROOT
+from ljn.geometry.alignment import procrustes_align, root_align
+
+MM_PER_METRE = 1000.0
+
+
+def joint_errors_mm(pred: Tensor, target: Tensor) -> Tensor:
+    """Return the distance of each predicted joint from the true one.
+
+    Args:
+        pred: `(..., K, 3)`, metres.
+        target: `(..., K, 3)`, metres, the same frame.
+
+    Returns:
+        `(..., K)`, mm, float64.
+    """
+    return _distances(pred, target, size=3) * MM_PER_METRE
+
+
+def mpjpe(pred: Tensor, target: Tensor) -> Tensor:
+    """Return the mean error over all K joints, the root among them (Eq. 3.8 leaves it out: `mpjpe_eq38`).
+
+    Args:
+        pred: `(..., K, 3)`, metres.
+        target: `(..., K, 3)`, metres, the same frame.
+
+    Returns:
+        `(...)`, mm, float64.
+    """
+    return joint_errors_mm(pred, target).mean(-1)
+
+
+def mpjpe_eq38(pred: Tensor, target: Tensor) -> Tensor:
+    """Return Eq. 3.8 to the letter: the sum over joints 2..K (all but the root), divided by K.
+
+    Args:
+        pred: `(..., K, 3)`, metres.
+        target: `(..., K, 3)`, metres, the same frame.
+
+    Returns:
+        `(...)`, mm, float64.
+    """
+    errors = joint_errors_mm(pred, target)
+    # A difference, not a slice: a root that is NaN must show.
+    return (errors.sum(-1) - errors[..., ROOT]) / errors.shape[-1]
+
+
+def mpjpe_root_aligned(pred: Tensor, target: Tensor) -> Tensor:
+    """Return the mean error over all K joints after moving both roots to the origin (the root's error is 0).
+
+    Args:
+        pred: `(..., K, 3)`, metres.
+        target: `(..., K, 3)`, metres, the same axes.
+
+    Returns:
+        `(...)`, mm, float64.
+    """
+    return mpjpe(root_align(pred.double(), ROOT), root_align(target.double(), ROOT))
+
+
+def mpjpe_procrustes(pred: Tensor, target: Tensor) -> Tensor:
+    """Return the mean error over all K joints after the best rotation, scale and translation of `pred`.
+
+    Args:
+        pred: `(..., K, 3)`, metres.
+        target: `(..., K, 3)`, metres.
+
+    Returns:
+        `(...)`, mm, float64.
+    """
+    return mpjpe(procrustes_align(pred.double(), target), target)
+
+
+def pckh_threshold_mm(target: Tensor) -> Tensor:
+    """Return half the length of the true head bone, PCKh@0.5's threshold (section 3.7.1).
+
+    Args:
+        target: `(..., 24, 3)`, metres, any frame.
+
+    Returns:
+        `(...)`, mm, float64.
+    """
+    if target.shape[-2:] != (NUM_JOINTS, 3):
+        raise ValueError(f"target must be SMPL joints (..., {NUM_JOINTS}, 3), got {tuple(target.shape)}")
+    neck, head = HEAD_BONE
+    return 0.5 * _distances(target[..., head, :], target[..., neck, :], size=3) * MM_PER_METRE
+
+
+def pckh(pred: Tensor, target: Tensor) -> Tensor:
+    """Return PCKh@0.5: the share of joints whose error is strictly less than half the true head bone.
+
+    Args:
+        pred: `(..., 24, 3)`, metres.
+        target: `(..., 24, 3)`, metres, the same frame.
+
+    Returns:
+        `(...)`, %, float64.
+    """
+    errors = joint_errors_mm(pred, target)
+    correct = (errors < pckh_threshold_mm(target)[..., None]).to(errors.dtype)
+    return 100.0 * correct.where(~errors.isnan(), errors).mean(-1)
+
+
+def keypoint_distances_px(noisy: Tensor, clean: Tensor) -> Tensor:
+    """Return how far the noise has moved each 2D keypoint.
+
+    Args:
+        noisy: `(..., K, 2)`, pixels.
+        clean: `(..., K, 2)`, pixels.
+
+    Returns:
+        `(..., K)`, pixels, float64.
+    """
+    return _distances(noisy, clean, size=2)
+
+
+def _distances(first: Tensor, second: Tensor, size: int) -> Tensor:
+    # Broadcasting would turn a forgotten dimension into a plausible number.
+    if first.shape != second.shape or first.shape[-1:] != (size,):
+        raise ValueError(
+            f"expected two tensors of the same shape (..., {size}), "
+            f"got {tuple(first.shape)} and {tuple(second.shape)}"
+        )
+    return (first.double() - second.double()).norm(dim=-1)

@@ -1,0 +1,41 @@
+"""The basic joint detector (section 3.3.2, Fig. 3.5): one PointNet regresses all joints."""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from ljn.body.skeleton import NUM_JOINTS
+from ljn.nets.detector import Detector
+from ljn.nets.layers import perceptron
+from ljn.nets.pointnet import PointNet
+
+
+class BasicDetector(Detector):
+    """Every point carries the 72 initial coordinates; a PointNet regresses 72 outputs.
+
+    Args:
+        in_channels: Channels of a point.
+        local_channels: First widths of the shared perceptron.
+        global_channels: Its other widths, up to the global feature.
+        head_channels: Hidden widths of the head.
+        output: See `Detector`.
+    """
+
+    def __init__(
+        self,
+        in_channels: int = 6,
+        local_channels: Sequence[int] = (64, 64),
+        global_channels: Sequence[int] = (64, 128, 1024),
+        head_channels: Sequence[int] = (512, 256),
+        output: str = "offset",
+    ) -> None:
+        super().__init__(output)
+        self.trunk = PointNet(in_channels + 3 * NUM_JOINTS, local_channels, global_channels)
+        self.head = perceptron([global_channels[-1], *head_channels, 3 * NUM_JOINTS], last_activation=False)
+
+    def regress(self, points: Tensor, initial_joints: Tensor) -> Tensor:
+        """See `Detector.regress`."""
+        coordinates = initial_joints.flatten(1)[:, None].expand(-1, points.shape[1], -1)
+        features = self.trunk(torch.cat([points, coordinates], -1))
+        return self.head(features.pooled).unflatten(-1, (NUM_JOINTS, 3))

@@ -1,0 +1,48 @@
+"""What every joint detector shares: the centred frame and the meaning of the output."""
+
+import torch
+from torch import Tensor, nn
+
+OUTPUTS = ("offset", "absolute")
+
+
+def cloud_centre(points: Tensor) -> Tensor:
+    """Mean position of the points: `(B, N, C)` -> `(B, 1, 3)`, metres."""
+    return points[..., :3].mean(1, keepdim=True)
+
+
+class Detector(nn.Module):
+    """Base of the joint detectors: cloud and initial joints in, joints out, all in the camera frame.
+
+    Everything is centred on the cloud's mean first, so a detector does not see where the person stands.
+    Subclasses implement `regress` in that frame.
+
+    Args:
+        output: `offset`: `regress` gives offsets to the initial joints; `absolute`: positions.
+    """
+
+    def __init__(self, output: str = "offset") -> None:
+        super().__init__()
+        if output not in OUTPUTS:
+            raise ValueError(f"output: expected one of {', '.join(OUTPUTS)}, got '{output}'")
+        self.output = output
+
+    def forward(self, points: Tensor, initial_joints: Tensor) -> Tensor:
+        """Predict the joints.
+
+        Args:
+            points: `(B, N, C)`: position (metres, camera frame) and further channels of each point.
+            initial_joints: `(B, 24, 3)`, metres, camera frame.
+
+        Returns:
+            `(B, 24, 3)`, metres, camera frame.
+        """
+        centre = cloud_centre(points)
+        points = torch.cat([points[..., :3] - centre, points[..., 3:]], -1)
+        joints = initial_joints - centre
+        prediction = self.regress(points, joints)
+        return prediction + (initial_joints if self.output == "offset" else centre)
+
+    def regress(self, points: Tensor, initial_joints: Tensor) -> Tensor:
+        """`(B, N, C)`, `(B, 24, 3)`, centred -> `(B, 24, 3)`: offsets or positions, as `output` says."""
+        raise NotImplementedError

@@ -1,0 +1,82 @@
+"""Layers shared by the networks: point-wise perceptrons, alone and stacked over the joints."""
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+
+def perceptron(channels: Sequence[int], last_activation: bool = True) -> nn.Sequential:
+    """Linear layers with a PReLU after each (after the last one on request).
+
+    Applied to `(..., channels[0])`; on a cloud `(B, N, C)` it is PointNet's shared MLP. No batch
+    normalisation: batches are small (section 3.6.1).
+    """
+    layers: list[nn.Module] = []
+    for number, (fan_in, fan_out) in enumerate(zip(channels, channels[1:]), start=1):
+        layers.append(nn.Linear(fan_in, fan_out))
+        if last_activation or number < len(channels) - 1:
+            layers.append(nn.PReLU())
+    return nn.Sequential(*layers)
+
+
+class StackedLinear(nn.Module):
+    """One linear layer for each joint, run as one batched product.
+
+    Each slice is initialised as an `nn.Linear` of its own.
+
+    Args:
+        num_joints: K.
+        fan_in: Input channels.
+        fan_out: Output channels.
+    """
+
+    def __init__(self, num_joints: int, fan_in: int, fan_out: int) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.empty(num_joints, fan_out, fan_in))
+        self.bias = nn.Parameter(torch.empty(num_joints, fan_out))
+        bound = 1 / math.sqrt(fan_in)
+        for weight, bias in zip(self.weight, self.bias):
+            nn.init.uniform_(weight, -bound, bound)
+            nn.init.uniform_(bias, -bound, bound)
+
+    def forward(self, x: Tensor) -> Tensor:
+        """`(K, M, fan_in)` -> `(K, M, fan_out)`."""
+        return torch.baddbmm(self.bias[:, None], x, self.weight.mT)
+
+
+class StackedPReLU(nn.Module):
+    """One PReLU slope for each joint."""
+
+    def __init__(self, num_joints: int) -> None:
+        super().__init__()
+        self.weight = nn.Parameter(torch.full((num_joints,), 0.25))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """`(K, ...)` -> `(K, ...)`."""
+        return functional.prelu(x.reshape(1, len(x), -1), self.weight).view(x.shape)
+
+
+def stacked_perceptron(num_joints: int, channels: Sequence[int], last_activation: bool = True) -> nn.Sequential:
+    """`perceptron` for each joint: `(K, M, channels[0])` -> `(K, M, channels[-1])`."""
+    layers: list[nn.Module] = []
+    for number, (fan_in, fan_out) in enumerate(zip(channels, channels[1:]), start=1):
+        layers.append(StackedLinear(num_joints, fan_in, fan_out))
+        if last_activation or number < len(channels) - 1:
+            layers.append(StackedPReLU(num_joints))
+    return nn.Sequential(*layers)
+
+
+def activate_and_pool(x: Tensor, activation: nn.PReLU | StackedPReLU, dim: int) -> Tensor:
+    """`activation(x).amax(dim)`, activated after pooling: the same values and a fraction of the work.
+
+    A PReLU is monotone, or with a negative slope V-shaped: its maximum over a set lies at the set's maximum or
+    minimum. `dim` must not be the joints' dimension of a `StackedPReLU`.
+    """
+    # max with indices: unlike amax, its gradient needs no pass over all of x to find ties.
+    pooled = activation(x.max(dim).values)
+    if bool((activation.weight < 0).any()):
+        pooled = torch.maximum(pooled, activation(x.min(dim).values))
+    return pooled

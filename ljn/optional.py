@@ -1,0 +1,20 @@
+"""Imports of optional packages, with the fix in the error when one is missing."""
+
+from typing import Any
+
+
+def import_open3d() -> Any:
+    """The `open3d` module.
+
+    Raises:
+        ImportError: It, or a system library that it loads, is missing; the message says what to install.
+    """
+    try:
+        import open3d
+    except (ImportError, OSError) as error:
+        raise ImportError(
+            f"Open3D cannot be loaded ({error}). Install it with `pip install -e '.[open3d]'` and the system "
+            "libraries libusb-1.0-0, libegl1 and libgl1; or do without it: data.normals=window and "
+            "data.renderer=zbuffer"
+        ) from error
+    return open3d

@@ -1,0 +1,171 @@
+"""A run's identity and what it leaves on disk: `config.yaml`, `record.json`, `metrics.json`.
+
+A run's directory is named by the hash of everything that its numbers depend on, so that the same command
+finds it again: to resume it, to skip it, or to share it.
+"""
+
+import hashlib
+import json
+import math
+import os
+import platform
+import subprocess
+import sys
+import time
+from collections.abc import Mapping
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from omegaconf import DictConfig, OmegaConf
+
+RECORD_VERSION = 1
+
+# What may differ between two runs that are the same run.
+_NOT_IDENTITY: dict[str, tuple[str, ...]] = {
+    "data": ("cache_dir", "num_workers", "prefetch_batches", "body_path", "body_gender"),
+    "trainer": (
+        "accelerator",
+        "devices",
+        "deterministic",
+        "enable_model_summary",
+        "enable_progress_bar",
+        "log_every_n_steps",
+        "num_sanity_val_steps",
+    ),
+}
+
+
+def identity(cfg: DictConfig, body_hash: str) -> dict[str, Any]:
+    """Everything that a run's numbers depend on, as plain values."""
+    plain: dict[str, Any] = OmegaConf.to_container(cfg, resolve=True)  # type: ignore[assignment]
+    kept: dict[str, Any] = {"seed": plain["seed"], "body": body_hash}
+    for group in ("data", "model", "module", "trainer"):
+        dropped = _NOT_IDENTITY.get(group, ())
+        kept[group] = {key: value for key, value in plain[group].items() if key not in dropped}
+    return kept
+
+
+def config_hash(plain: Mapping[str, Any]) -> str:
+    """First 8 hex digits of the SHA-256 of plain values, whatever the order of their keys."""
+    return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()[:8]
+
+
+def run_directory(output_dir: Path, kind: str, name: str, preset: str, identity_hash: str) -> Path:
+    """`output_dir/kind/NAME-PRESET-HASH`."""
+    return output_dir / kind / f"{name.replace('/', '-')}-{preset}-{identity_hash}"
+
+
+def write_json(path: Path, content: Mapping[str, Any]) -> None:
+    """Write a JSON file, whole or not at all. NaN and infinity are written as null."""
+    draft = path.with_name(f"{path.name}.{os.getpid()}.tmp")
+    draft.write_text(json.dumps(_finite(content), indent=2, allow_nan=False) + "\n")
+    draft.replace(path)
+
+
+def read_json(path: Path) -> dict[str, Any] | None:
+    """The content of a JSON file; None where there is none, or a damaged one."""
+    try:
+        content = json.loads(path.read_text())
+    except (OSError, ValueError):
+        return None
+    return content if isinstance(content, dict) else None
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    if isinstance(value, Mapping):
+        return {key: _finite(entry) for key, entry in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(entry) for entry in value]
+    return value
+
+
+class RunRecord:
+    """The record of one run, kept on disk from its first moment: a context manager.
+
+    `record.json` says `running` on entry and on exit `complete`, `interrupted` (Ctrl-C, SIGTERM) or `failed`
+    with the error; after `kill -9` it still says `running`. A second attempt adds to the wall time.
+
+    Args:
+        directory: The run's directory.
+        facts: What else the record holds: name, hashes, seeds, data, device and the like.
+    """
+
+    def __init__(self, directory: Path, facts: Mapping[str, Any]) -> None:
+        self.directory = directory
+        self._facts = dict(facts)
+        before = read_json(directory / "record.json") or {}
+        self._wall_time_before = float(before.get("wall_time_s") or 0.0)
+        self._attempts = int(before.get("attempts") or 0) + 1
+
+    def __enter__(self) -> Self:
+        self.directory.mkdir(parents=True, exist_ok=True)
+        self._started = time.monotonic()
+        self._facts = {
+            "record_version": RECORD_VERSION,
+            "status": "running",
+            **self._facts,
+            "started": datetime.now(UTC).isoformat(timespec="seconds"),
+            "attempts": self._attempts,
+            "versions": _versions(),
+            "machine": {"platform": platform.platform(), "cpu_count": os.cpu_count()},
+            **_commit(),
+        }
+        self._write()
+        return self
+
+    def add(self, **facts: Any) -> None:
+        """Add facts, on disk at once."""
+        self._facts.update(facts)
+        self._write()
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if error is None:
+            self.add(status="complete")
+        elif isinstance(error, KeyboardInterrupt | SystemExit):
+            # The trainer turns Ctrl-C into SystemExit once it has shut down.
+            self.add(status="interrupted")
+        else:
+            self.add(status="failed", error=f"{type(error).__name__}: {error}")
+
+    def _write(self) -> None:
+        elapsed = time.monotonic() - self._started
+        self._facts["wall_time_s"] = round(self._wall_time_before + elapsed, 1)
+        write_json(self.directory / "record.json", self._facts)
+
+
+def is_complete(directory: Path, identity_hash: str) -> bool:
+    """Whether a run of that identity has finished in a directory."""
+    record = read_json(directory / "record.json") or {}
+    return (
+        record.get("status") == "complete"
+        and record.get("config_hash") == identity_hash
+        and read_json(directory / "metrics.json") is not None
+    )
+
+
+def _versions() -> dict[str, str]:
+    packages = ("ljn", "torch", "lightning", "numpy", "hydra-core", "numba")
+    return {"python": sys.version.split()[0]} | {name: version(name) for name in packages}
+
+
+def _commit() -> dict[str, Any]:
+    """Commit of the code, and whether its files differ from it; None outside a checkout."""
+
+    def git(*arguments: str) -> str | None:
+        try:
+            done = subprocess.run(
+                ["git", *arguments], cwd=Path(__file__).parent, capture_output=True, text=True, timeout=10, check=True
+            )
+        except (OSError, subprocess.SubprocessError):
+            return None
+        return done.stdout.strip()
+
+    status = git("status", "--porcelain", "--untracked-files=no")
+    return {"commit": git("rev-parse", "HEAD"), "is_dirty": None if status is None else bool(status)}

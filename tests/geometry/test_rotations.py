@@ -1,0 +1,136 @@
+import math
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from ljn.geometry.rotations import (
+    BODY_TO_OPENGL,
+    CAMERA_FROM_BODY,
+    body_world_pose_to_smpl,
+    rotation_about,
+    rotmat_to_rotvec,
+    rotvec_to_rotmat,
+    smpl_pose_to_body_world,
+)
+
+DTYPE = torch.float64
+AXES = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [0.6, -0.8, 0.0], [-0.48, 0.6, 0.64]]
+ANGLES = [0.0, 1e-12, 1e-7, 3e-3, 3.2e-3, 0.1, 1.0, 2.0, math.pi - 1e-7, math.pi]
+
+
+def random_rotvecs(*shape, scale=1.5, dtype=DTYPE):
+    return scale * torch.randn(*shape, 3, dtype=dtype, generator=torch.Generator().manual_seed(0))
+
+
+@pytest.mark.parametrize("angle", [*ANGLES, 4.0, 10.0])
+@pytest.mark.parametrize("axis", AXES)
+def test_rotmat_equals_scipy(axis, angle):
+    rotvec = angle * torch.tensor(axis, dtype=DTYPE)
+    np.testing.assert_allclose(
+        rotvec_to_rotmat(rotvec), Rotation.from_rotvec(rotvec.numpy()).as_matrix(), atol=2e-15
+    )
+
+
+@pytest.mark.parametrize("angle", ANGLES)
+@pytest.mark.parametrize("axis", AXES)
+def test_rotvec_equals_scipy_up_to_the_sign_of_a_half_turn(axis, angle):
+    rotvec = angle * torch.tensor(axis, dtype=DTYPE)
+    result = rotmat_to_rotvec(torch.tensor(Rotation.from_rotvec(rotvec.numpy()).as_matrix()))
+    if angle == math.pi and torch.dot(result, rotvec) < 0:
+        result = -result
+    np.testing.assert_allclose(result, rotvec, atol=1e-14)
+
+
+@pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 3e-6), (torch.float64, 1e-14)])
+def test_round_trip_of_many_rotations_keeps_the_matrix_and_batch_shape(dtype, tolerance):
+    rotmat = rotvec_to_rotmat(random_rotvecs(50, 40, dtype=dtype))
+    rotvec = rotmat_to_rotvec(rotmat)
+    assert rotvec.shape == (50, 40, 3)
+    assert rotvec.norm(dim=-1).max() <= math.pi + tolerance
+    torch.testing.assert_close(rotvec_to_rotmat(rotvec), rotmat, atol=tolerance, rtol=0)
+
+
+def test_rotmat_is_a_rotation_in_float32():
+    rotmat = rotvec_to_rotmat(random_rotvecs(1000, scale=3, dtype=torch.float32))
+    torch.testing.assert_close(rotmat @ rotmat.mT, torch.eye(3).expand(1000, 3, 3), atol=2e-6, rtol=0)
+    torch.testing.assert_close(torch.linalg.det(rotmat), torch.ones(1000), atol=2e-6, rtol=0)
+
+
+@pytest.mark.parametrize("angle", ANGLES)
+def test_gradient_of_rotmat_is_right_at_zero_and_near_half_turns(angle):
+    rotvec = (angle * torch.tensor(AXES, dtype=DTYPE)).requires_grad_()
+    assert torch.autograd.gradcheck(rotvec_to_rotmat, rotvec)
+
+
+@pytest.mark.parametrize("angle", [*ANGLES[:-2], 3.1])
+def test_gradient_of_rotvec_is_right_at_the_identity_and_near_half_turns(angle):
+    rotmat = rotvec_to_rotmat(angle * torch.tensor(AXES, dtype=DTYPE)).requires_grad_()
+    assert torch.autograd.gradcheck(rotmat_to_rotvec, rotmat)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_gradients_are_finite_at_exact_identity_and_half_turns(dtype):
+    half_turns = torch.diag_embed(2 * torch.eye(3, dtype=dtype) - 1)
+    rotmat = torch.cat([torch.eye(3, dtype=dtype)[None], half_turns]).requires_grad_()
+    rotvec = rotmat_to_rotvec(rotmat)
+    torch.testing.assert_close(rotvec.abs(), math.pi * torch.eye(4, 3, dtype=dtype).roll(1, 0))
+    rotvec_to_rotmat(rotvec).square().sum().backward()
+    assert rotmat.grad.isfinite().all()
+
+
+@pytest.mark.parametrize("axis", "xyz")
+def test_rotation_about_an_axis_equals_scipy(axis):
+    angle = torch.tensor([[0.0, 0.3], [-2.0, math.pi]], dtype=DTYPE)
+    expected = Rotation.from_euler(axis, angle.reshape(-1, 1).numpy()).as_matrix().reshape(2, 2, 3, 3)
+    np.testing.assert_allclose(rotation_about(axis, angle), expected, atol=1e-15)
+
+
+def test_body_axes_reach_opengl_and_opencv_cameras():
+    forward, left, up = torch.eye(3, dtype=DTYPE)
+    torch.testing.assert_close(
+        BODY_TO_OPENGL @ torch.stack([left, up, forward], 1), torch.eye(3, dtype=DTYPE)
+    )
+    right, down, away = -left, -up, -forward  # of a body that faces the camera, as its camera sees it
+    torch.testing.assert_close(
+        CAMERA_FROM_BODY @ torch.stack([-right, down, away], 1), torch.eye(3, dtype=DTYPE)
+    )
+    opencv_from_opengl = torch.diag(torch.tensor([1, -1, -1], dtype=DTYPE))
+    torch.testing.assert_close(CAMERA_FROM_BODY, opencv_from_opengl @ BODY_TO_OPENGL)
+    assert torch.linalg.det(CAMERA_FROM_BODY).item() == pytest.approx(1)
+
+
+def test_a_body_at_rest_in_smpl_axes_stands_along_z_and_faces_x_in_body_world():
+    root = rotvec_to_rotmat(smpl_pose_to_body_world(torch.zeros(72, dtype=DTYPE))[:3])
+    up, forward = torch.eye(3, dtype=DTYPE)[1], torch.eye(3, dtype=DTYPE)[2]
+    torch.testing.assert_close(root @ up, torch.tensor([0.0, 0.0, 1.0], dtype=DTYPE))
+    torch.testing.assert_close(root @ forward, torch.tensor([1.0, 0.0, 0.0], dtype=DTYPE))
+
+
+def test_pose_frames_turn_the_root_from_the_left_and_back_and_touch_nothing_else():
+    pose = 0.8 * torch.randn(4, 5, 72, dtype=DTYPE, generator=torch.Generator().manual_seed(1))
+    world = smpl_pose_to_body_world(pose)
+    expected = BODY_TO_OPENGL.T @ rotvec_to_rotmat(pose[..., :3])
+    torch.testing.assert_close(rotvec_to_rotmat(world[..., :3]), expected)
+    assert torch.equal(world[..., 3:], pose[..., 3:])
+    torch.testing.assert_close(body_world_pose_to_smpl(world), pose)
+    assert smpl_pose_to_body_world(pose.float()).dtype == torch.float32
+
+
+@pytest.mark.parametrize(
+    ("function", "shape", "message"),
+    [
+        (rotvec_to_rotmat, (5, 4), r"rotvec: expected shape \(\.\.\., 3\), got \(5, 4\)"),
+        (rotmat_to_rotvec, (3,), r"rotmat: expected shape \(\.\.\., 3, 3\), got \(3,\)"),
+        (smpl_pose_to_body_world, (2, 24, 3), r"pose: expected shape \(\.\.\., 72\), got \(2, 24, 3\)"),
+    ],
+)
+def test_a_wrong_shape_is_named(function, shape, message):
+    with pytest.raises(ValueError, match=message):
+        function(torch.zeros(shape))
+
+
+def test_an_unknown_axis_is_named():
+    with pytest.raises(ValueError, match="axis: expected 'x', 'y' or 'z', got 'w'"):
+        rotation_about("w", torch.zeros(()))

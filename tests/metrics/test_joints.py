@@ -1,0 +1,212 @@
+import json
+import math
+import pickle
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+import ljn.metrics as metrics_module
+from ljn.metrics import JointMetrics, MaxKeypointDistance, SampleMax, SampleMean, functional
+
+KEYS = {
+    "mpjpe",
+    "mpjpe_eq38",
+    "mpjpe_root_aligned",
+    "mpjpe_procrustes",
+    "pckh",
+    "pckh_threshold_mm",
+    "initial_mpjpe",
+    "initial_mean_distance_px",
+    "initial_max_distance_px",
+}
+JOINT_METRICS = {
+    "MPJPE": functional.mpjpe,
+    "MPJPEEq38": functional.mpjpe_eq38,
+    "RootAlignedMPJPE": functional.mpjpe_root_aligned,
+    "ProcrustesMPJPE": functional.mpjpe_procrustes,
+    "PCKh": functional.pckh,
+}
+NUM_SAMPLES = 13
+
+
+def make_batch(num_samples):
+    generator = torch.Generator().manual_seed(0)
+
+    def noise(size):
+        return torch.randn(num_samples, 24, size, generator=generator)
+
+    joints, keypoints = 0.3 * noise(3) + 2, 60 * noise(2) + 200
+    return {
+        "pred_joints": joints + 0.05 * noise(3),
+        "joints": joints,
+        "initial_joints": joints + 0.08 * noise(3),
+        "noisy_keypoints_2d": keypoints + 10 * noise(2),
+        "keypoints_2d": keypoints,
+    }
+
+
+def updated(metrics, batch, sizes):
+    start = 0
+    for size in sizes:
+        metrics.update(**{name: value[start : start + size] for name, value in batch.items()})
+        start += size
+    return metrics
+
+
+def values(metrics):
+    return {key: value.item() for key, value in metrics.compute().items()}
+
+
+def test_joint_metrics_are_the_means_and_maximum_of_the_functional_forms():
+    batch = make_batch(NUM_SAMPLES)
+    pred, joints, initial, noisy, clean = batch.values()
+    distances = functional.keypoint_distances_px(noisy, clean)
+    expected = {
+        "mpjpe": functional.mpjpe(pred, joints).mean(),
+        "mpjpe_eq38": functional.mpjpe_eq38(pred, joints).mean(),
+        "mpjpe_root_aligned": functional.mpjpe_root_aligned(pred, joints).mean(),
+        "mpjpe_procrustes": functional.mpjpe_procrustes(pred, joints).mean(),
+        "pckh": functional.pckh(pred, joints).mean(),
+        "pckh_threshold_mm": functional.pckh_threshold_mm(joints).mean(),
+        "initial_mpjpe": functional.mpjpe(initial, joints).mean(),
+        "initial_mean_distance_px": distances.mean(),
+        "initial_max_distance_px": distances.max(),
+    }
+    computed = updated(JointMetrics(), batch, [NUM_SAMPLES]).compute()
+    assert computed.keys() == expected.keys() == KEYS
+    for key, value in computed.items():
+        torch.testing.assert_close(value, expected[key], rtol=1e-12, atol=0)
+
+
+def test_prefix_stands_before_every_key():
+    metrics = updated(JointMetrics(prefix="val/"), make_batch(2), [2])
+    assert set(metrics.compute()) == {f"val/{key}" for key in KEYS}
+
+
+@pytest.mark.parametrize("sizes", [[1] * NUM_SAMPLES, [12, 1], [5, 0, 8]])
+def test_result_does_not_depend_on_the_batches(sizes):
+    batch = make_batch(NUM_SAMPLES)
+    whole = values(updated(JointMetrics(), batch, [NUM_SAMPLES]))
+    assert values(updated(JointMetrics(), batch, sizes)) == pytest.approx(whole, rel=1e-12)
+
+
+def test_metrics_that_agree_on_the_first_batch_stay_separate():
+    first, second = make_batch(4), make_batch(7)
+    first["pred_joints"] = first["initial_joints"]
+    metrics = updated(updated(JointMetrics(), first, [4]), second, [7])
+    both = {name: torch.cat([first[name], second[name]]) for name in first}
+    assert values(metrics) == pytest.approx(values(updated(JointMetrics(), both, [11])), rel=1e-12)
+    assert values(metrics)["mpjpe"] != values(metrics)["initial_mpjpe"]
+
+
+def test_reset_forgets_everything():
+    batch = make_batch(4)
+    metrics = updated(JointMetrics(), make_batch(9), [9])
+    metrics.compute()
+    metrics.reset()
+    assert values(updated(metrics, batch, [4])) == values(updated(JointMetrics(), batch, [4]))
+
+
+@pytest.mark.parametrize("name", JOINT_METRICS)
+def test_each_joint_metric_stands_alone(name):
+    metric = getattr(metrics_module, name)()
+    pred, joints = list(make_batch(NUM_SAMPLES).values())[:2]
+    metric.update(pred[:5], joints[:5])
+    metric.update(pred[5:], joints[5:])
+    expected = JOINT_METRICS[name](pred, joints)
+    torch.testing.assert_close(metric.compute(), expected.mean(), rtol=1e-12, atol=0)
+    metric.reset()
+    torch.testing.assert_close(metric(pred[:5], joints[:5]), expected[:5].mean(), rtol=1e-12, atol=0)
+
+
+@pytest.mark.filterwarnings("ignore:The ``compute`` method")
+def test_no_samples_give_nan():
+    assert all(math.isnan(value) for value in values(JointMetrics()).values())
+
+
+def test_one_nan_prediction_makes_every_score_of_the_prediction_nan():
+    batch = make_batch(NUM_SAMPLES)
+    batch["pred_joints"][3, 5, 0] = torch.nan
+    computed = values(updated(JointMetrics(), batch, [2, 2, 9]))
+    assert {key for key, value in computed.items() if math.isnan(value)} == {
+        "mpjpe",
+        "mpjpe_eq38",
+        "mpjpe_root_aligned",
+        "mpjpe_procrustes",
+        "pckh",
+    }
+
+
+def test_a_nan_keypoint_makes_the_maximum_nan():
+    metric = MaxKeypointDistance()
+    clean = torch.zeros(2, 24, 2)
+    noisy = clean.clone()
+    noisy[0, 0, 0] = torch.nan
+    metric.update(noisy[:1], clean[:1])
+    metric.update(noisy[1:], clean[1:])
+    assert metric.compute().isnan()
+
+
+def test_sums_stay_float64_in_a_half_precision_module():
+    batch = make_batch(NUM_SAMPLES)
+    metrics = updated(JointMetrics().to(torch.float16), batch, [6, 7])
+    assert values(metrics) == pytest.approx(values(updated(JointMetrics(), batch, [NUM_SAMPLES])), rel=1e-12)
+
+
+def test_states_follow_the_module_to_a_device():
+    for metric in JointMetrics().to("meta").values():
+        states = [metric.total, metric.count] if isinstance(metric, SampleMean) else [metric.maximum]
+        assert all(state.device.type == "meta" for state in states)
+        assert isinstance(metric, SampleMean | SampleMax)
+
+
+def test_joint_metrics_can_be_pickled():
+    metrics = updated(JointMetrics("test/"), make_batch(3), [3])
+    assert values(pickle.loads(pickle.dumps(metrics))) == values(metrics)
+
+
+DDP_WORKER = """
+import json, sys
+import torch
+import torch.distributed as dist
+from ljn.metrics import JointMetrics
+
+folder, rank = sys.argv[1], int(sys.argv[2])
+torch.set_num_threads(1)
+dist.init_process_group("gloo", init_method=f"file://{folder}/init", rank=rank, world_size=2)
+batch = torch.load(f"{folder}/batch.pt")
+metrics = JointMetrics()
+# Unequal shares, in a different number of batches.
+for rows in ([slice(0, 4), slice(4, 5)], [slice(5, 13)])[rank]:
+    metrics.update(**{name: value[rows] for name, value in batch.items()})
+print(json.dumps({key: value.item() for key, value in metrics.compute().items()}))
+dist.destroy_process_group()
+"""
+
+
+@pytest.mark.ddp
+def test_two_processes_compute_what_one_does(tmp_path):
+    if not torch.distributed.is_gloo_available():
+        pytest.skip("this torch build has no gloo backend")
+    batch = make_batch(NUM_SAMPLES)
+    torch.save(batch, tmp_path / "batch.pt")
+    workers = [
+        subprocess.Popen(
+            [sys.executable, "-c", DDP_WORKER, str(tmp_path), str(rank)],
+            cwd=Path(__file__).parents[2],
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        for rank in range(2)
+    ]
+    try:
+        outputs = [worker.communicate(timeout=120)[0] for worker in workers]
+    finally:
+        for worker in workers:
+            worker.kill()
+    expected = values(updated(JointMetrics(), batch, [NUM_SAMPLES]))
+    for output in outputs:
+        assert json.loads(output) == pytest.approx(expected, rel=1e-12)
