@@ -5,7 +5,12 @@ python run.py experiment=detector/proposed                 train, then test the 
 python run.py task=evaluate ckpt_path=CHECKPOINT           test a checkpoint
 """
 
+import os
+import sys
+
 import hydra
+from hydra.core.hydra_config import HydraConfig
+from hydra.types import RunMode
 from omegaconf import DictConfig
 
 from ljn.tasks.schema import register
@@ -16,7 +21,13 @@ register()
 @hydra.main(version_base="1.3", config_path="conf", config_name="config")
 def main(cfg: DictConfig) -> float | None:
     """Run the task that `cfg.task` names; returns the metric that `cfg.optimized_metric` names."""
-    metrics = hydra.utils.get_method(cfg.task._target_)(cfg)
+    try:
+        metrics = hydra.utils.get_method(cfg.task._target_)(cfg)
+    except (ValueError, FileNotFoundError, ImportError) as error:
+        # A user's mistake: the message names the fix. A sweep needs the exception, a developer the traceback.
+        if HydraConfig.get().mode == RunMode.MULTIRUN or os.environ.get("HYDRA_FULL_ERROR") == "1":
+            raise
+        sys.exit(f"error: {error}\n(HYDRA_FULL_ERROR=1 shows where it was raised)")
     for name, value in metrics.items():
         print(f"{name:32s}{value:10.3f}")
     return metrics.get(cfg.optimized_metric)

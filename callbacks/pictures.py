@@ -10,8 +10,8 @@ from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.loggers import WandbLogger
 from torch import Tensor
 
-from ljn.batch import Batch
 from ljn.body.skeleton import BONES
+from ljn.data import Batch
 from ljn.metrics.functional import mpjpe
 
 if TYPE_CHECKING:
@@ -55,8 +55,6 @@ class JointPictures(Callback):
         self.every_n_epochs = every_n_epochs
         self._has_warned = False
         self._validation: list[Sample] = []
-        self._errors: list[Tensor] = []
-        self._extremes: dict[int, Sample] = {}
         self._test_joints: list[tuple[Tensor, Tensor]] = []
 
     def on_validation_batch_end(
@@ -74,7 +72,12 @@ class JointPictures(Callback):
         for row in range(min(self.num_samples - len(self._validation), len(batch["joints"]))):
             error = float(mpjpe(outputs["pred_joints"][row], batch["joints"][row]))
             self._validation.append(
-                _sample(batch, outputs["pred_joints"], row, f"sample {int(batch['sample_id'][row])}: {error:.0f} mm")
+                _sample(
+                    batch,
+                    outputs["pred_joints"],
+                    row,
+                    f"sample {int(batch['sample_id'][row])}: {error:.0f} mm",
+                )
             )
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
@@ -107,7 +110,7 @@ class JointPictures(Callback):
         batch_size = len(kept[0][0])
         needed = {index // batch_size for indices in kinds.values() for index in indices}
         points: dict[int, Tensor] = {}
-        for batch_idx, batch in enumerate(trainer.test_dataloaders):
+        for batch_idx, batch in enumerate(trainer.test_dataloaders or []):
             if batch_idx in needed:
                 points |= {batch_idx * batch_size + row: value for row, value in enumerate(batch["points"])}
             if batch_idx >= max(needed):
@@ -148,7 +151,8 @@ class JointPictures(Callback):
 
 def _sample(batch: Batch, pred_joints: Tensor, row: int, title: str) -> Sample:
     tensors = (batch["points"][row, :, :3], batch["joints"][row], pred_joints[row])
-    return Sample(*(tensor.detach().cpu().numpy() for tensor in tensors), title)
+    points, joints, predicted = (tensor.detach().cpu().numpy() for tensor in tensors)
+    return Sample(points, joints, predicted, title)
 
 
 def draw_samples(samples: list[Sample], num_columns: int) -> "Figure":
@@ -166,7 +170,7 @@ def draw_samples(samples: list[Sample], num_columns: int) -> "Figure":
     from matplotlib.figure import Figure
 
     num_rows = -(-len(samples) // num_columns)
-    figure = Figure(figsize=(3.2 * num_columns, 3.4 * num_rows), dpi=100, layout="constrained")
+    figure = Figure(figsize=(3.8 * num_columns, 2.3 * num_rows + 0.3), dpi=100, layout="constrained")
     FigureCanvasAgg(figure)
     axes = figure.subplots(num_rows, 2 * num_columns, squeeze=False)
     for axis in axes.flat:

@@ -8,7 +8,7 @@ import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
 from torch import Tensor
 
-from ljn.batch import Batch
+from ljn.data import Batch
 from ljn.metrics.functional import joint_errors_mm
 
 

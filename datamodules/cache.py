@@ -13,9 +13,7 @@ import torch
 from torch import Tensor
 
 
-def cached_samples(
-    directory: Path, key: str, make: Callable[[], Mapping[str, Tensor]]
-) -> dict[str, Tensor]:
+def cached_samples(directory: Path, key: str, make: Callable[[], Mapping[str, Tensor]]) -> dict[str, Tensor]:
     """The samples stored under `key`, made and stored first where they are missing.
 
     A set is written beside its place and then renamed into it: it is there whole or not at all, also when two

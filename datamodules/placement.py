@@ -33,6 +33,15 @@ def draw_heading(kind: str, rng: np.random.Generator) -> float:
     return float(math.copysign(low + position * (high - low), sign - 0.5))
 
 
+def check_margin(camera: Camera, margin_px: float) -> None:
+    """Raise a `ValueError` if a clear border of `margin_px` leaves nothing of the camera's image."""
+    if min(camera.width, camera.height) - 1 <= 2 * margin_px:
+        raise ValueError(
+            f"margin_px: a clear border of {margin_px} px leaves nothing of an image of {camera.width} x "
+            f"{camera.height} (width x height) pixels"
+        )
+
+
 def place(
     vertices: np.ndarray,
     camera: Camera,
@@ -59,11 +68,7 @@ def place(
     Raises:
         ValueError: The image is smaller than its two margins.
     """
-    if min(camera.width, camera.height) - 1 <= 2 * margin_px:
-        raise ValueError(
-            f"margin_px: a clear border of {margin_px} px leaves nothing of an image of {camera.width} x "
-            f"{camera.height} (width x height) pixels"
-        )
+    check_margin(camera, margin_px)
     z = vertices[:, 2]
     centre = (z.min() + z.max()) / 2
     depth = distance_m[0] + uniform[2] * (distance_m[1] - distance_m[0]) - centre

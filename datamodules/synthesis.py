@@ -1,21 +1,21 @@
 """From a pose record to a training sample: mesh, depth image, noisy cloud with normals, initial joints."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from datamodules.placement import HEADINGS, draw_heading, place
+from datamodules.placement import HEADINGS, check_margin, draw_heading, place
 from datamodules.sources import PoseRecords
-from ljn.batch import Batch
 from ljn.body import SMPL, BodyModel
 from ljn.cloud.keypoints import lift_keypoints
 from ljn.cloud.normals import NormalEstimator, get_normal_estimator
 from ljn.cloud.sampling import add_depth_noise, sample_cloud
+from ljn.data import Batch
 from ljn.geometry.camera import Camera, project
 from ljn.geometry.rotations import CAMERA_FROM_BODY, rotation_about, rotmat_to_rotvec, rotvec_to_rotmat
 from ljn.render import RENDERERS, Renderer, get_renderer
@@ -57,6 +57,7 @@ class SynthesisSettings:
             raise ValueError(f"heading: expected one of {', '.join(HEADINGS)}, got '{self.heading}'")
         if self.renderer not in RENDERERS:
             raise ValueError(f"renderer: expected one of {', '.join(RENDERERS)}, got '{self.renderer}'")
+        check_margin(self.camera, self.margin_px)
         if not 0 < self.distance_m[0] <= self.distance_m[1]:
             raise ValueError(f"distance_m: expected 0 < nearest <= farthest, got {self.distance_m}")
         for name in ("margin_px", "depth_noise_m", "keypoint_noise_px"):
@@ -86,7 +87,9 @@ class DepthSynthesizer:
         dtype: torch.dtype = torch.float32,
     ) -> None:
         if settings.heading == "source" and not records.has_heading:
-            raise ValueError("heading: these poses carry no heading of their own; use 'histogram' or 'uniform'")
+            raise ValueError(
+                "heading: these poses carry no heading of their own; use 'histogram' or 'uniform'"
+            )
         self.records = records
         self.body = body
         self.settings = settings
@@ -183,6 +186,20 @@ def add_keypoint_noise(
     return noisy.astype(np.float32)
 
 
-def concatenate(batches: Sequence[Batch]) -> dict[str, Tensor]:
-    """Batches joined along their first dimension."""
-    return {name: torch.cat([batch[name] for batch in batches]) for name in Batch.__annotations__}  # type: ignore[literal-required]
+def concatenate(batches: Iterable[Batch], num_samples: int) -> dict[str, Tensor]:
+    """Batches of `num_samples` samples in all, joined along their first dimension.
+
+    Copied as they come: while it lives, a tensor from a worker process holds shared memory and an open file, of
+    which there are few.
+    """
+    samples: dict[str, Tensor] = {}
+    start = 0
+    for batch in batches:
+        stop = start + len(batch["sample_id"])
+        for name, value in cast(dict[str, Tensor], batch).items():
+            if name not in samples:
+                samples[name] = value.new_empty((num_samples, *value.shape[1:]))
+            samples[name][start:stop] = value
+        start = stop
+    assert start == num_samples
+    return samples

@@ -7,26 +7,25 @@ from pathlib import Path
 from typing import Any, cast
 
 import torch
-from lightning.pytorch import LightningDataModule
 from torch import Tensor
 from torch.utils.data import BatchSampler, DataLoader, Dataset, Sampler
 
 from datamodules.cache import cached_samples
 from datamodules.sources import SPLITS, PoseSource
 from datamodules.synthesis import DepthSynthesizer, SynthesisSettings, concatenate
-from ljn.batch import Batch
 from ljn.body import BodyModel, load_body_model
 from ljn.cloud.normals import get_normal_estimator
+from ljn.data import Batch, BodyDataModule
 from ljn.geometry.camera import Camera
 from ljn.render import get_renderer
 
 _LOG = logging.getLogger(__name__)
 # Raise it when the same settings begin to give other samples: cached sets of before are then left alone.
-_SAMPLES_VERSION = 1
+_SAMPLES_VERSION = 2
 _CHUNK = 16
 
 
-class SyntheticDepthDataModule(LightningDataModule):
+class SyntheticDepthDataModule(BodyDataModule):
     """Bodies from a pose source, seen by a depth camera.
 
     Training samples are made in worker processes, anew in every epoch; a sample depends on the seed, the epoch
@@ -120,6 +119,22 @@ class SyntheticDepthDataModule(LightningDataModule):
             self._body = load_body_model(self.body_path, self.body_gender)
         return self._body
 
+    @property
+    def licence(self) -> str:
+        """The source's licence; see `BodyDataModule`."""
+        return self.source.licence
+
+    def describe(self) -> dict[str, Any]:
+        """See `BodyDataModule`."""
+        return {
+            "source": self.source.name,
+            "fingerprint": self.source.fingerprint,
+            "licence": self.source.licence,
+            "sizes": self.sizes,
+            "body": {"hash": self.body.hash, "gender": self.body.gender},
+            "seeds": {"seed": self.seed, "pool_seed": self.pool_seed, "eval_seed": self.eval_seed},
+        }
+
     def prepare_data(self) -> None:
         """Check every file and package that will be needed, before anything expensive starts."""
         self.source.check()
@@ -131,7 +146,9 @@ class SyntheticDepthDataModule(LightningDataModule):
         """Build the sets that a stage (`fit`, `validate` or `test`) needs."""
         if stage == "fit" and self._train is None:
             records = self.source.records("train", self.sizes["train"], self.pool_seed)
-            self._train = DepthSynthesizer(records, self.body, self.settings, (self.seed, SPLITS.index("train")))
+            self._train = DepthSynthesizer(
+                records, self.body, self.settings, (self.seed, SPLITS.index("train"))
+            )
         needed = {"fit": ["val"], "validate": ["val"], "test": ["test"]}[stage]
         for split in needed:
             if split not in self._fixed:
@@ -141,7 +158,7 @@ class SyntheticDepthDataModule(LightningDataModule):
         """Samples rendered as they are needed; the last, incomplete batch is dropped."""
         if self._train is None:
             raise RuntimeError("setup('fit') has not been called")
-        sampler = EpochSampler(self.sizes["train"], self.seed)
+        sampler: Any = EpochSampler(self.sizes["train"], self.seed)
         batches = BatchSampler(sampler, self.batch_size, drop_last=len(sampler) >= self.batch_size)
         return self._loader(SynthesizedSamples(self._train), batches)
 
@@ -156,8 +173,8 @@ class SyntheticDepthDataModule(LightningDataModule):
     def fixed_key(self, split: str) -> str:
         """Hash of everything that a fixed set depends on."""
         made_of = (
-            f"{_SAMPLES_VERSION} {split} {self.sizes[split]} {self.pool_seed} {self.eval_seed} {self.settings} {self.body.hash} "
-            f"{self.source.name} {self.source.fingerprint}"
+            f"{_SAMPLES_VERSION} {split} {self.sizes[split]} {self.pool_seed} {self.eval_seed} {self.settings} "
+            f"{self.body.hash} {self.source.name} {self.source.fingerprint}"
         )
         return f"{split}-{hashlib.sha256(made_of.encode()).hexdigest()[:16]}"
 
@@ -171,7 +188,8 @@ class SyntheticDepthDataModule(LightningDataModule):
             # Chunks of one size whatever the batch size: the body's products then round alike.
             keys = [(0, index) for index in range(len(records))]
             chunks = [keys[start : start + _CHUNK] for start in range(0, len(keys), _CHUNK)]
-            return concatenate(list(self._loader(SynthesizedSamples(synthesizer), chunks, persistent=False)))
+            batches = self._loader(SynthesizedSamples(synthesizer), chunks, persistent=False)
+            return concatenate(batches, len(records))
 
         return cached_samples(self.cache_dir, self.fixed_key(split), make)
 
@@ -238,7 +256,7 @@ class EpochSampler(Sampler[tuple[int, int]]):
             yield epoch, index
 
 
-def _as_is(batch: Batch) -> Batch:
+def _as_is(batch: Any) -> Any:
     return batch
 
 

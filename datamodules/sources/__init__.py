@@ -36,7 +36,9 @@ class PoseRecords:
         for name, tail in shapes.items():
             got = getattr(self, name).shape
             if got != (len(self.pose), *tail):
-                raise ValueError(f"{name}: expected shape {('R', *tail)} with R = {len(self.pose)}, got {got}")
+                raise ValueError(
+                    f"{name}: expected shape {('R', *tail)} with R = {len(self.pose)}, got {got}"
+                )
         for name in ("pose", "betas"):
             bad = np.flatnonzero(~np.isfinite(getattr(self, name)).all(-1))
             if len(bad):

@@ -2,6 +2,8 @@
 
 import hashlib
 import json
+import zipfile
+import zlib
 from functools import cached_property
 from pathlib import Path
 
@@ -45,6 +47,8 @@ class EmbeddedSource:
         path: str | Path | None = None,
         split_path: str | Path | None = None,
     ) -> None:
+        if max_beta <= 0:
+            raise ValueError(f"max_beta: expected more than 0, got {max_beta}")
         self.jitter_deg = jitter_deg
         self.max_beta = max_beta
         self.path = Path(path or _DATA / "seed_poses.npz")
@@ -66,9 +70,11 @@ class EmbeddedSource:
         if not self.path.is_file():
             raise FileNotFoundError(f"poses: no file {self.path}; leave `path` out to use the embedded clips")
         try:
+            if not zipfile.is_zipfile(self.path):
+                raise ValueError("not a .npz archive")
             with np.load(self.path, allow_pickle=False) as file:
                 poses, clip = file["poses"].astype(np.float32), file["clip"]
-        except (OSError, ValueError, KeyError, EOFError) as error:
+        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
             raise ValueError(
                 f"poses: {self.path} cannot be read ({error}); expected an .npz file with `poses` (N, 72) and "
                 "`clip` (N,) names"
@@ -86,10 +92,18 @@ class EmbeddedSource:
     def _split(self) -> dict[str, list[str]]:
         if not self.split_path.is_file():
             raise FileNotFoundError(f"poses: no split file {self.split_path}")
-        split = json.loads(self.split_path.read_text())
-        named = [clip for name in SPLITS for clip in split.get(name, [])]
+        try:
+            split = json.loads(self.split_path.read_text())
+        except ValueError as error:
+            raise ValueError(f"poses: {self.split_path} is no JSON file ({error})") from error
+        is_table = isinstance(split, dict) and all(isinstance(clips, list) for clips in split.values())
+        if not is_table or set(split) != set(SPLITS):
+            raise ValueError(
+                f"poses: {self.split_path} must hold a list of clips for each of {', '.join(SPLITS)}"
+            )
+        named = [clip for name in SPLITS for clip in split[name]]
         unknown = sorted(set(named) - set(self._clips[1].tolist()))
-        if set(split) != set(SPLITS) or unknown or len(named) != len(set(named)):
+        if unknown or len(named) != len(set(named)):
             raise ValueError(
                 f"poses: {self.split_path} must list each clip under one of {', '.join(SPLITS)}; unknown clips: "
                 f"{unknown or 'none'}, clips named twice: {sorted({c for c in named if named.count(c) > 1}) or 'none'}"
@@ -103,6 +117,8 @@ class EmbeddedSource:
         rng = np.random.default_rng([seed, SPLITS.index(split)])
         poses, clip = self._clips
         clips = self._split[split]
+        if not clips:
+            raise ValueError(f"split: {self.split_path} lists no clips for '{split}'")
         weight = np.sqrt([np.count_nonzero(clip == name) for name in clips])
         chosen = rng.choice(len(clips), num_records, p=weight / weight.sum())
         row = np.empty(num_records, np.int64)
@@ -117,7 +133,9 @@ class EmbeddedSource:
         mirrored = rotvec[:, list(MIRROR)] * torch.tensor([1.0, -1.0, -1.0], dtype=torch.float64)
         is_mirrored = torch.from_numpy(rng.random(num_records) < 0.5)
         rotvec = torch.where(is_mirrored[:, None, None], mirrored, rotvec)
-        jitter = torch.from_numpy(rng.standard_normal((num_records, NUM_JOINTS, 3))) * np.deg2rad(self.jitter_deg)
+        jitter = torch.from_numpy(rng.standard_normal((num_records, NUM_JOINTS, 3))) * np.deg2rad(
+            self.jitter_deg
+        )
         jitter[:, ROOT] = 0
         rotvec = rotmat_to_rotvec(rotvec_to_rotmat(rotvec) @ rotvec_to_rotmat(jitter))
         pose = without_heading(smpl_pose_to_body_world(rotvec.flatten(-2)))

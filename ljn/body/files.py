@@ -30,8 +30,9 @@ NUM_BETAS = 10
 NUM_POSE_FEATURES = 9 * (NUM_JOINTS - 1)
 
 _DATA_DIR = Path(__file__).parent / "data"
+_KEYS = ("v_template", "shapedirs", "posedirs", "J_regressor", "weights", "kintree_table", "f")
+"""The arrays of a file, under SMPL's own names."""
 _NOT_SMPL = "Give a SMPL model file (not SMPL+H, SMPL-X or MANO)."
-_DAMAGED = "The file is damaged: fetch it again."
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +105,9 @@ class BodyModel:
             array = np.array(value, np.int64 if name == "faces" else np.float32, order="C")
             array = array + 0  # -0.0 becomes 0.0: a dense and a sparse regressor have one hash
         if not np.isfinite(array).all():
-            raise self._error(f"{name} should be finite, got NaN or infinite values. {_DAMAGED}")
+            raise self._error(
+                f"{name} should be finite, got NaN or infinite values: damaged. Fetch it again."
+            )
         array.flags.writeable = False
         return array
 
@@ -194,10 +197,6 @@ def _check_gender(gender: str) -> None:
         raise ValueError(f"gender: expected one of {', '.join(GENDERS)}, got {gender!r}")
 
 
-_KEYS = ("v_template", "shapedirs", "posedirs", "J_regressor", "weights", "kintree_table", "f")
-"""The arrays of a file, under SMPL's own names."""
-
-
 def _read_npz(data: bytes) -> dict[str, NDArray[Any]]:
     if not zipfile.is_zipfile(io.BytesIO(data)):
         raise ValueError("not a .npz archive")
@@ -221,7 +220,7 @@ class _ForbiddenError(Exception):
 
 
 _READ_ERRORS = (
-    ArithmeticError, AttributeError, EOFError, LookupError, MemoryError, OSError, RecursionError, TypeError,
+    ArithmeticError, AttributeError, EOFError, LookupError, MemoryError, OSError, RuntimeError, TypeError,
     ValueError, pickle.UnpicklingError, zipfile.BadZipFile, zlib.error,
 )  # fmt: skip
 """What a damaged file makes numpy, zipfile and pickle raise."""
@@ -322,7 +321,7 @@ _SPARSE = {"csr": _Compressed, "csc": _CompressedColumns, "coo": _Coordinates}
 
 
 class _DataUnpickler(pickle.Unpickler):
-    """Reads a pickle into containers, text, numbers and records; nothing is imported, nothing called."""
+    """Reads a pickle into containers, text, numbers and records; nothing that it names is imported or run."""
 
     def find_class(self, module: str, name: str) -> type:
         """The stand-in for a global that the file names."""

@@ -38,4 +38,6 @@ def _levels() -> tuple[tuple[int, ...], ...]:
 LEVELS: tuple[tuple[int, ...], ...] = _levels()
 """Joints by their distance from the root: all of a level can be moved at once."""
 
-BONES: tuple[tuple[int, int], ...] = tuple((parent, joint) for joint, parent in enumerate(PARENTS) if parent >= 0)
+BONES: tuple[tuple[int, int], ...] = tuple(
+    (parent, joint) for joint, parent in enumerate(PARENTS) if parent >= 0
+)

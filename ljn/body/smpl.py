@@ -106,8 +106,8 @@ class SMPL(nn.Module):
         Returns:
             Vertices `(..., V, 3)` and joints `(..., 24, 3)`, metres.
         """
-        self._check("pose", pose, pose.shape[:-1], 3 * NUM_JOINTS)
-        self._check("betas", betas, pose.shape[:-1], NUM_BETAS)
+        _check_shape("pose", pose, pose.shape[:-1], 3 * NUM_JOINTS)
+        _check_shape("betas", betas, pose.shape[:-1], NUM_BETAS)
         vertices, joints = self._by_gender(self._pose, gender, betas, pose)
         return SMPLOutput(vertices, joints)
 
@@ -121,7 +121,7 @@ class SMPL(nn.Module):
         Returns:
             `(..., 24, 3)`, metres, SMPL's rest frame.
         """
-        self._check("betas", betas, betas.shape[:-1], NUM_BETAS)
+        _check_shape("betas", betas, betas.shape[:-1], NUM_BETAS)
         (joints,) = self._by_gender(lambda slot, flat: (self._rest_joints(slot, flat),), gender, betas)
         return joints
 
@@ -196,11 +196,6 @@ class SMPL(nn.Module):
         homogeneous = pad(unposed, (0, 0, 0, 1), value=1.0)  # (B, 4, V)
         return (blended * homogeneous[:, None]).sum(2).transpose(1, 2).contiguous()
 
-    def _check(self, name: str, value: Tensor, leading: torch.Size, last: int) -> None:
-        expected = (*leading, last)
-        if value.shape != expected:
-            raise ValueError(f"{name}: expected shape {expected}, got {tuple(value.shape)}")
-
 
 def _layout(model: BodyModel) -> dict[str, Tensor]:
     """A body's buffers: coordinates before vertices, contiguous as the matrix products want them."""
@@ -214,3 +209,9 @@ def _layout(model: BodyModel) -> dict[str, Tensor]:
         "_J_shapedirs": J_shapedirs.flatten(1).float(),  # (10, 72)
         "_weights": torch.tensor(model.weights).T.contiguous(),  # (24, V)
     }
+
+
+def _check_shape(name: str, value: Tensor, leading: torch.Size, last: int) -> None:
+    expected = (*leading, last)
+    if value.shape != expected:
+        raise ValueError(f"{name}: expected shape {expected}, got {tuple(value.shape)}")

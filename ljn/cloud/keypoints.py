@@ -44,7 +44,7 @@ def _nearest_depth(depth: np.ndarray, keypoints: np.ndarray) -> np.ndarray:
     found = np.zeros(len(keypoints), np.float32)
     for k in range(len(keypoints)):
         u, v = keypoints[k, 0], keypoints[k, 1]
-        column, row = int(round(u)), int(round(v))
+        column, row = round(u), round(v)
         if 0 <= column < width and 0 <= row < height and depth[row, column] > 0:
             found[k] = depth[row, column]
             continue
@@ -55,7 +55,7 @@ def _nearest_depth(depth: np.ndarray, keypoints: np.ndarray) -> np.ndarray:
             if step > 1 and (step - 1) ** 2 >= best:
                 break
             for side in range(2 if step > 0 else 1):
-                row = int(round(v)) + (step if side == 0 else -step)
+                row = round(v) + (step if side == 0 else -step)
                 if not 0 <= row < height:
                     continue
                 room = best - (row - v) ** 2

@@ -81,7 +81,7 @@ def _window_normals(
         z0 = float(depth[v, u])
         x0 = (u - cx) / fx * z0
         y0 = (v - cy) / fy * z0
-        count = 0
+        count = su = sv = suu = suv = svv = 0
         sx = sy = sz = sxx = sxy = sxz = syy = syz = szz = 0.0
         for row in range(max(v - radius, 0), min(v + radius + 1, height)):
             for column in range(max(u - radius, 0), min(u + radius + 1, width)):
@@ -92,7 +92,13 @@ def _window_normals(
                 x = (column - cx) / fx * zn - x0
                 y = (row - cy) / fy * zn - y0
                 z = zn - z0
+                du, dv = column - u, row - v
                 count += 1
+                su += du
+                sv += dv
+                suu += du * du
+                suv += du * dv
+                svv += dv * dv
                 sx += x
                 sy += y
                 sz += z
@@ -102,6 +108,8 @@ def _window_normals(
                 syy += y * y
                 syz += y * z
                 szz += z * z
+        # Exact, in integers: the rays of a line of pixels lie in one plane, and noise would fit just that plane.
+        is_line = (count * suu - su * su) * (count * svv - sv * sv) == (count * suv - su * sv) ** 2
         n = max(count, 1)
         nx, ny, nz = _smallest_eigenvector(
             sxx / n - sx * sx / n / n,
@@ -111,7 +119,7 @@ def _window_normals(
             syz / n - sy * sz / n / n,
             szz / n - sz * sz / n / n,
         )
-        if nx == 0.0 and ny == 0.0 and nz == 0.0:
+        if is_line or (nx == 0.0 and ny == 0.0 and nz == 0.0):
             length = math.sqrt(x0 * x0 + y0 * y0 + z0 * z0)
             nx, ny, nz = -x0 / length, -y0 / length, -z0 / length
         elif nx * x0 + ny * y0 + nz * z0 > 0.0:
@@ -154,8 +162,9 @@ def _smallest_eigenvector(
         length = x * x + y * y + z * z
         if length > best:
             best, nx, ny, nz = length, x, y, z
-    # Below this the two smallest eigenvalues agree: the points lie on a line.
-    if best < 1e-20:
+    # `best` is the squared gap between the two smallest eigenvalues, at a trace of 1. The arc cosine knows these
+    # to 1e-8 where they agree (points on a line), so that a smaller gap says nothing.
+    if best < 1e-12:
         return 0.0, 0.0, 0.0
     length = math.sqrt(best)
     return nx / length, ny / length, nz / length

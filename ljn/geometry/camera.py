@@ -1,5 +1,6 @@
 """Pinhole cameras: projection and back-projection (the Pi of Eq. 3.4 and its inverse)."""
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -27,8 +28,8 @@ class Camera:
     height: int
 
     def __post_init__(self) -> None:
-        if min(self.fx, self.fy, self.width, self.height) <= 0:
-            raise ValueError(f"camera: focal lengths and image size must be positive, got {self}")
+        if not all(0 < value < math.inf for value in (self.fx, self.fy, self.width, self.height)):
+            raise ValueError(f"camera: focal lengths and image size must be positive and finite, got {self}")
         if not (0 <= self.cx < self.width and 0 <= self.cy < self.height):
             raise ValueError(
                 f"camera: the principal point ({self.cx}, {self.cy}) lies outside the image of "

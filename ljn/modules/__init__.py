@@ -1,0 +1,1 @@
+"""LightningModules: networks with their losses, optimizers and metrics."""

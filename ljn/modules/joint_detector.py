@@ -1,7 +1,6 @@
 """Stage 1 as a LightningModule: training, validation and test of a joint detector."""
 
 from collections.abc import Callable
-from typing import Any
 
 import torch
 from lightning.pytorch import LightningModule
@@ -10,7 +9,7 @@ from torch import Tensor
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
 
-from ljn.batch import Batch
+from ljn.data import Batch
 from ljn.losses import joint_loss
 from ljn.metrics import JointMetrics
 from ljn.nets.detector import Detector
@@ -55,11 +54,13 @@ class JointDetector(LightningModule):
         loss = joint_loss(self(batch["points"], batch["initial_joints"]), batch["joints"])
         if not bool(torch.isfinite(loss)):
             raise FloatingPointError(
-                f"the training loss is {float(loss)} in epoch {self.current_epoch}, batch {batch_idx}; lower the "
+                f"the training loss is {loss.item()} in epoch {self.current_epoch}, batch {batch_idx}; lower the "
                 "learning rate, or check the data (samples "
                 f"{batch['sample_id'].tolist()})"
             )
-        self.log("train/loss", loss, prog_bar=True, on_step=False, on_epoch=True, batch_size=len(batch["joints"]))
+        self.log(
+            "train/loss", loss, prog_bar=True, on_step=False, on_epoch=True, batch_size=len(batch["joints"])
+        )
         return loss
 
     def validation_step(self, batch: Batch, batch_idx: int) -> dict[str, Tensor]:

@@ -19,6 +19,9 @@ class LocalJointNetwork(Detector):
     relative to that joint, its local feature, the cloud's global feature and row i of the initial joints'
     distance matrix. Sub-network i, a PointNet classifier, gives the output of joint i.
 
+    Relative positions are in units of the ball's radius: in metres they are small beside the other inputs, and
+    learning is much slower.
+
     Args:
         radii_m: Ball radius of each of the 24 joints, metres.
         group_size: Points in a group (l' of the thesis).
@@ -65,7 +68,9 @@ class LocalJointNetwork(Detector):
         self.first_activation = StackedPReLU(NUM_JOINTS)
         self.group = stacked_perceptron(NUM_JOINTS, group_channels, last_activation=False)
         self.group_activation = StackedPReLU(NUM_JOINTS)
-        self.head = stacked_perceptron(NUM_JOINTS, [group_channels[-1], *head_channels, 3], last_activation=False)
+        self.head = stacked_perceptron(
+            NUM_JOINTS, [group_channels[-1], *head_channels, 3], last_activation=False
+        )
 
     def regress(self, points: Tensor, initial_joints: Tensor) -> Tensor:
         """See `Detector.regress`."""
@@ -73,8 +78,9 @@ class LocalJointNetwork(Detector):
         local, pooled = self.trunk(points)
         index = ball_group(points[..., :3], initial_joints, self.radii, self.group_size)  # (B, K, n)
         grouped = gather_points(torch.cat([points[..., :3], local], -1), index)  # (B, K, n, 3 + C)
-        origin = torch.cat([initial_joints, local.new_zeros(batch, NUM_JOINTS, local.shape[-1])], -1)
-        grouped = (grouped - origin[:, :, None]).transpose(0, 1)  # (K, B, n, 3 + C)
+        position, feature = grouped.split([3, local.shape[-1]], -1)
+        relative = (position - initial_joints[:, :, None]) / self.radii[:, None, None]
+        grouped = torch.cat([relative, feature], -1).transpose(0, 1)  # (K, B, n, 3 + C)
 
         hidden = self._first_layer(grouped, pooled, initial_joints)  # (K, B * n, C')
         hidden = self.group(hidden).unflatten(1, (batch, self.group_size))

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from itertools import pairwise
 
 import torch
 from torch import Tensor, nn
@@ -15,7 +16,7 @@ def perceptron(channels: Sequence[int], last_activation: bool = True) -> nn.Sequ
     normalisation: batches are small (section 3.6.1).
     """
     layers: list[nn.Module] = []
-    for number, (fan_in, fan_out) in enumerate(zip(channels, channels[1:]), start=1):
+    for number, (fan_in, fan_out) in enumerate(pairwise(channels), start=1):
         layers.append(nn.Linear(fan_in, fan_out))
         if last_activation or number < len(channels) - 1:
             layers.append(nn.PReLU())
@@ -59,10 +60,12 @@ class StackedPReLU(nn.Module):
         return functional.prelu(x.reshape(1, len(x), -1), self.weight).view(x.shape)
 
 
-def stacked_perceptron(num_joints: int, channels: Sequence[int], last_activation: bool = True) -> nn.Sequential:
+def stacked_perceptron(
+    num_joints: int, channels: Sequence[int], last_activation: bool = True
+) -> nn.Sequential:
     """`perceptron` for each joint: `(K, M, channels[0])` -> `(K, M, channels[-1])`."""
     layers: list[nn.Module] = []
-    for number, (fan_in, fan_out) in enumerate(zip(channels, channels[1:]), start=1):
+    for number, (fan_in, fan_out) in enumerate(pairwise(channels), start=1):
         layers.append(StackedLinear(num_joints, fan_in, fan_out))
         if last_activation or number < len(channels) - 1:
             layers.append(StackedPReLU(num_joints))

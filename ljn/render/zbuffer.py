@@ -64,7 +64,10 @@ def _rasterise(
                 ec = sign * ((ua - u) * (vb - v) - (ub - u) * (va - v))
                 if ec < 0.0:
                     continue
-                w = (ea * wa + eb * wb + ec * wc) / (ea + eb + ec)
+                total = ea + eb + ec
+                if total == 0.0:  # a sliver thinner than rounding: its neighbours have this pixel
+                    continue
+                w = (ea * wa + eb * wb + ec * wc) / total
                 if w > buffer[v, u]:
                     buffer[v, u] = w
     for v in range(top, bottom + 1):

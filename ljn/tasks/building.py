@@ -37,7 +37,9 @@ def check_targets(config: Any, where: str = "") -> None:
 def _check_target(target: str, where: str) -> None:
     allowed = ", ".join(ALLOWED_MODULES)
     if not target.startswith(ALLOWED_MODULES):
-        raise ValueError(f"{where}: `_target_: {target}` is outside the modules that a config may name: {allowed}")
+        raise ValueError(
+            f"{where}: `_target_: {target}` is outside the modules that a config may name: {allowed}"
+        )
     module, _, name = target.rpartition(".")
     try:
         found = getattr(import_module(module), name)

@@ -91,7 +91,9 @@ def load_state(module: torch.nn.Module, checkpoint: Checkpoint) -> None:
     expected = {name: tuple(value.shape) for name, value in module.state_dict().items()}
     got = {name: tuple(value.shape) for name, value in checkpoint.state.items()}
     if expected != got:
-        differing = sorted(name for name in expected.keys() | got.keys() if expected.get(name) != got.get(name))
+        differing = sorted(
+            name for name in expected.keys() | got.keys() if expected.get(name) != got.get(name)
+        )
         name = differing[0]
         raise ValueError(
             f"ckpt_path: '{checkpoint.path}' holds the weights of another model: {len(differing)} tensors differ, "

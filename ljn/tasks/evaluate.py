@@ -9,11 +9,12 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf, open_dict
 
+from ljn.data import BodyDataModule
 from ljn.tasks import records
 from ljn.tasks.building import build, check_targets
 from ljn.tasks.checkpoints import Checkpoint, load_state, read_checkpoint
 from ljn.tasks.tracking import finish_tracking, link_run
-from ljn.tasks.train import build_trainer, describe_data, is_multirun, prepare_process, save_config, test
+from ljn.tasks.train import build_trainer, is_multirun, prepare_process, save_config, test
 from ljn.tasks.validation import validate
 
 _LOG = logging.getLogger(__name__)
@@ -21,7 +22,19 @@ _LOG = logging.getLogger(__name__)
 # Whose values a checkpoint decides, and whose this call does.
 _FROM_CHECKPOINT = ("preset", "model", "module", "data", "body", "trainer", "seed", "name")
 _OVERRIDABLE = ("data", "trainer", "body")
-_FROM_CALL = ("task", "callbacks", "logger", "paths", "hydra", "num_threads", "ckpt_path", "rerun", "tags", "group", "sweep")
+_FROM_CALL = (
+    "task",
+    "callbacks",
+    "logger",
+    "paths",
+    "hydra",
+    "num_threads",
+    "ckpt_path",
+    "rerun",
+    "tags",
+    "group",
+    "sweep",
+)
 
 
 def evaluate(cfg: DictConfig) -> dict[str, float]:
@@ -47,12 +60,12 @@ def evaluate(cfg: DictConfig) -> dict[str, float]:
     cfg = with_checkpoint_config(cfg, checkpoint, overrides)
     validate(cfg, is_multirun=is_multirun())
 
-    datamodule = build(cfg.data)
+    datamodule: BodyDataModule = build(cfg.data)
     datamodule.prepare_data()
     if datamodule.body.hash != checkpoint.body_hash:
         raise ValueError(
             f"body: the checkpoint was trained with the body {checkpoint.body_hash}, this is "
-            f"{datamodule.body.hash}; a model is only meaningful with its body: name that file with body.path=FILE"
+            f"{datamodule.body.hash}; a model is only meaningful with its body: name it with body.path=FILE"
         )
     identity = {**records.identity(cfg, datamodule.body.hash), "checkpoint": checkpoint.file_hash}
     identity_hash = records.config_hash(identity)
@@ -70,8 +83,7 @@ def evaluate(cfg: DictConfig) -> dict[str, float]:
         "config_hash": identity_hash,
         "trained_by": checkpoint.run,
         "checkpoint": {"path": str(checkpoint.path), "hash": checkpoint.file_hash, "epoch": checkpoint.epoch},
-        "seeds": {"pool_seed": cfg.data.pool_seed, "eval_seed": cfg.data.eval_seed},
-        **describe_data(datamodule),
+        "data": datamodule.describe(),
     }
     with records.RunRecord(run_dir, facts) as record:
         config = save_config(cfg, run_dir)
@@ -111,8 +123,8 @@ def with_checkpoint_config(cfg: DictConfig, checkpoint: Checkpoint, overrides: l
             continue
         if group not in _OVERRIDABLE or "." not in key:
             raise ValueError(
-                f"{override.input_line}: model, data and sizes come from the checkpoint; an evaluation can change "
-                f"single values of {', '.join(_OVERRIDABLE)} (data.keypoint_noise_px=15) and choose "
+                f"{override.input_line}: model, data and sizes come from the checkpoint; an evaluation can "
+                f"change single values of {', '.join(_OVERRIDABLE)} (data.keypoint_noise_px=15) and choose "
                 f"{', '.join(_FROM_CALL[1:4])}"
             )
         _set(merged, key, override.value(), override.input_line)

@@ -1,5 +1,6 @@
 """Trackers: what they are told once, and their end."""
 
+import os
 from collections.abc import Mapping
 from typing import Any
 
@@ -18,6 +19,8 @@ def link_run(
         config: Resolved configuration, plain values.
         trained_by: For an evaluation: the training run that the checkpoint came from.
     """
+    # Its closing banner would bury a sweep's lines; WANDB_SILENT=false brings it back.
+    os.environ.setdefault("WANDB_SILENT", "true")
     for logger in trainer.loggers:
         if isinstance(logger, WandbLogger):
             logger._wandb_init.update(id=run_id, resume="allow")
@@ -29,4 +32,4 @@ def finish_tracking(trainer: lightning.Trainer) -> None:
     if any(isinstance(logger, WandbLogger) for logger in trainer.loggers):
         import wandb
 
-        wandb.finish(quiet=True)
+        wandb.finish()

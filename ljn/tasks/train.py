@@ -11,6 +11,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf, open_dict
 
+from ljn.data import BodyDataModule
 from ljn.tasks import records
 from ljn.tasks.building import build, build_each
 from ljn.tasks.tracking import finish_tracking, link_run
@@ -33,7 +34,7 @@ def train(cfg: DictConfig) -> dict[str, float]:
         FileNotFoundError: A file that it names is missing.
     """
     validate(cfg, is_multirun=is_multirun())
-    datamodule = build(cfg.data)
+    datamodule: BodyDataModule = build(cfg.data)
     datamodule.prepare_data()
     identity = records.identity(cfg, datamodule.body.hash)
     identity_hash = records.config_hash(identity)
@@ -54,8 +55,7 @@ def train(cfg: DictConfig) -> dict[str, float]:
         "name": cfg.name,
         "preset": cfg.preset.name,
         "config_hash": identity_hash,
-        "seeds": {"seed": cfg.seed, "pool_seed": cfg.data.pool_seed, "eval_seed": cfg.data.eval_seed},
-        **describe_data(datamodule),
+        "data": datamodule.describe(),
         "num_parameters": sum(parameter.numel() for parameter in module.parameters()),
     }
     with records.RunRecord(run_dir, facts) as record:
@@ -89,12 +89,12 @@ def prepare_process(cfg: DictConfig) -> None:
 
 
 def build_trainer(
-    cfg: DictConfig, run_dir: Path, config: dict[str, Any], datamodule: lightning.LightningDataModule
+    cfg: DictConfig, run_dir: Path, config: dict[str, Any], datamodule: BodyDataModule
 ) -> lightning.Trainer:
     """The trainer with its callbacks and loggers, writing below the run's directory."""
     from callbacks.provenance import Provenance
 
-    provenance = Provenance(config, datamodule.body.hash, datamodule.source.licence, run_dir.name)
+    provenance = Provenance(config, datamodule.body.hash, datamodule.licence, run_dir.name)
     return build(
         cfg.trainer,
         default_root_dir=str(run_dir),
@@ -106,26 +106,12 @@ def build_trainer(
 def test(
     trainer: lightning.Trainer,
     module: lightning.LightningModule,
-    datamodule: lightning.LightningDataModule,
+    datamodule: BodyDataModule,
     ckpt_path: Path | None,
 ) -> dict[str, float]:
     """The test metrics of a checkpoint, or of the module as it is."""
     [metrics] = trainer.test(module, datamodule, ckpt_path=ckpt_path, verbose=False, weights_only=True)
     return {name: float(value) for name, value in metrics.items()}
-
-
-def describe_data(datamodule: lightning.LightningDataModule) -> dict[str, Any]:
-    """What a record says of the data."""
-    source, body = datamodule.source, datamodule.body
-    return {
-        "body": {"hash": body.hash, "gender": body.gender},
-        "data": {
-            "source": source.name,
-            "fingerprint": source.fingerprint,
-            "licence": source.licence,
-            "sizes": datamodule.sizes,
-        },
-    }
 
 
 def save_config(cfg: DictConfig, run_dir: Path) -> dict[str, Any]:

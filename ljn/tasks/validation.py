@@ -28,8 +28,8 @@ def validate(cfg: DictConfig, is_multirun: bool = False) -> None:
     devices = trainer.get("devices")
     if is_multirun and (strategy.startswith(_MULTI_PROCESS) or (isinstance(devices, int) and devices > 1)):
         raise ValueError(
-            f"trainer: several processes (strategy='{strategy or 'auto'}', devices={devices}) do not go with a "
-            "multirun, whose every child process would start the sweep again; use trainer.devices=1"
+            f"trainer: several processes (strategy='{strategy or 'auto'}', devices={devices}) do not go with "
+            "a multirun, whose every child process would start the sweep again; use trainer.devices=1"
         )
     check_writable(Path(plain["paths"]["output_dir"]))
 

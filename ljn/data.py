@@ -1,8 +1,12 @@
-"""The contract between data and models: what a batch holds."""
+"""The contract between data, models and tasks: what a batch holds, what a data module can say of itself."""
 
-from typing import TypedDict
+from abc import abstractmethod
+from typing import Any, TypedDict
 
+from lightning.pytorch import LightningDataModule
 from torch import Tensor
+
+from ljn.body import BodyModel
 
 
 class Batch(TypedDict):
@@ -31,3 +35,21 @@ class Batch(TypedDict):
     gender: Tensor
     camera: Tensor
     sample_id: Tensor
+
+
+class BodyDataModule(LightningDataModule):
+    """Base of the data modules, whose loaders give `Batch`es: what tasks ask beside that."""
+
+    @property
+    @abstractmethod
+    def body(self) -> BodyModel:
+        """The body that the data shows."""
+
+    @property
+    @abstractmethod
+    def licence(self) -> str:
+        """Where the data comes from and what may be done with it: goes into checkpoints."""
+
+    @abstractmethod
+    def describe(self) -> dict[str, Any]:
+        """Source, fingerprint, sizes and the like: goes into records."""

@@ -1,0 +1,80 @@
+import itertools
+
+import numpy as np
+import pytest
+import torch
+
+from datamodules.placement import draw_heading
+from datamodules.sources.embedded import EmbeddedSource
+from datamodules.synthetic import SyntheticDepthDataModule
+from ljn.body import SMPL, load_body_model
+from ljn.geometry.camera import Camera
+from ljn.geometry.rotations import CAMERA_FROM_BODY, rotation_about, rotmat_to_rotvec, rotvec_to_rotmat
+from ljn.optional import import_open3d
+
+
+@pytest.fixture(scope="session")
+def kinect():
+    """The depth camera of a Kinect v2, stood upright."""
+    return Camera(fx=366.458, fy=366.736, cx=206.470, cy=253.026, width=424, height=512)
+
+
+@pytest.fixture(scope="session")
+def body():
+    return load_body_model()
+
+
+@pytest.fixture(scope="session")
+def source():
+    return EmbeddedSource()
+
+
+@pytest.fixture(scope="session")
+def bodies(body, source):
+    """64 posed meshes `(64, V, 3)` with random headings, and their faces: metres, camera axes, at the origin."""
+    records = source.records("train", 64, seed=5)
+    rng = np.random.default_rng(5)
+    pose = torch.from_numpy(records.pose).double()
+    heading = torch.tensor([draw_heading("histogram", rng) for _ in range(64)], dtype=torch.float64)
+    root = rotmat_to_rotvec(rotation_about("z", heading) @ rotvec_to_rotmat(pose[:, :3]))
+    layer = SMPL(body).double()
+    vertices = layer(torch.cat([root, pose[:, 3:]], -1), torch.from_numpy(records.betas).double()).vertices
+    return (vertices @ CAMERA_FROM_BODY.T).numpy(), layer.faces
+
+
+@pytest.fixture(scope="session")
+def make_datamodule(kinect, body, source, tmp_path_factory):
+    """Builds a small data module; each with a cache of its own unless `cache_dir` is given."""
+    numbers = itertools.count()
+
+    def make(**changes):
+        arguments = {
+            "source": source,
+            "camera": kinect,
+            "num_points": 32,
+            "num_train": 40,
+            "num_val": 20,
+            "num_test": 8,
+            "batch_size": 8,
+            "seed": 0,
+            "pool_seed": 0,
+            "eval_seed": 0,
+            "num_workers": 0,
+        }
+        if "cache_dir" not in changes:
+            arguments["cache_dir"] = tmp_path_factory.mktemp(f"samples{next(numbers)}")
+        datamodule = SyntheticDepthDataModule(**{**arguments, **changes})
+        if "body_path" not in changes:
+            datamodule._body = body  # read once for all
+        return datamodule
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def open3d():
+    """The `open3d` module; without it the test is skipped, saying what is missing."""
+    try:
+        return import_open3d()
+    except ImportError as error:
+        pytest.skip(str(error))

@@ -1,0 +1,318 @@
+import logging
+import math
+import os
+import resource
+
+import numpy as np
+import pytest
+import torch
+from lightning.fabric.utilities.data import _set_sampler_epoch
+
+from datamodules.placement import place
+from datamodules.sources.embedded import EmbeddedSource
+from datamodules.synthesis import concatenate
+from datamodules.synthetic import EpochSampler
+from ljn.body import SMPL
+from ljn.body.skeleton import ROOT
+from ljn.geometry.camera import project
+from ljn.geometry.rotations import CAMERA_FROM_BODY, rotvec_to_rotmat
+
+
+@pytest.fixture(scope="module")
+def train_loader(make_datamodule, tmp_path_factory):
+    """Builds a data module's loader of training samples; their validation sample is rendered but once."""
+    cache_dir = tmp_path_factory.mktemp("validation")
+
+    def make(**changes):
+        datamodule = make_datamodule(num_val=1, cache_dir=cache_dir, **changes)
+        datamodule.setup("fit")
+        return datamodule.train_dataloader()
+
+    return make
+
+
+def assert_same_bits(one, other):
+    assert set(one) == set(other)
+    for name in one:
+        assert torch.equal(one[name], other[name]), name
+
+
+def val_set(datamodule):
+    datamodule.prepare_data()
+    datamodule.setup("validate")
+    return concatenate(datamodule.val_dataloader(), datamodule.sizes["val"])
+
+
+def set_epoch(loader, epoch):
+    """As the trainer does before each epoch."""
+    _set_sampler_epoch(loader, epoch)
+
+
+def batches_of(loader, epoch, number=2):
+    set_epoch(loader, epoch)
+    batches = iter(loader)
+    return [next(batches) for _ in range(number)]
+
+
+# Fixed sets
+
+
+def test_validation_sets_are_the_same_bits_for_any_number_of_workers_batch_size_and_threads(make_datamodule):
+    threads = torch.get_num_threads()
+    try:
+        torch.set_num_threads(2)
+        expected = val_set(make_datamodule())
+        torch.set_num_threads(1)
+        for changes in ({"num_workers": 1, "batch_size": 3}, {"num_workers": 2}):
+            assert_same_bits(val_set(make_datamodule(**changes)), expected)
+    finally:
+        torch.set_num_threads(threads)
+    assert expected["sample_id"].tolist() == list(range(20))
+
+
+def test_validation_sets_depend_on_neither_the_training_seed_nor_its_size(make_datamodule):
+    sets = [val_set(make_datamodule(num_val=4, **changes)) for changes in ({}, {"seed": 5, "num_train": 50})]
+    assert_same_bits(*sets)
+
+
+def test_a_smaller_validation_set_shares_its_draws_with_a_larger_one(make_datamodule):
+    # The same placement and noise for the same index; the records are drawn for the whole set.
+    few, many = (val_set(make_datamodule(num_val=number)) for number in (4, 6))
+    noises = [s["noisy_keypoints_2d"][:4] - s["keypoints_2d"][:4] for s in (few, many)]
+    assert (noises[0] - noises[1]).abs().median() < 1e-3
+
+
+def test_validation_batches_come_in_order_and_leave_none_out(make_datamodule):
+    datamodule = make_datamodule(num_val=10, batch_size=4)
+    datamodule.setup("validate")
+    assert [b["sample_id"].tolist() for b in datamodule.val_dataloader()] == [
+        [0, 1, 2, 3],
+        [4, 5, 6, 7],
+        [8, 9],
+    ]
+
+
+def test_a_fixed_set_is_rendered_once_and_shared_by_data_modules_that_want_the_same(
+    make_datamodule, tmp_path, caplog
+):
+    with caplog.at_level(logging.INFO, "datamodules.synthetic"):
+        first = val_set(make_datamodule(num_val=4, cache_dir=tmp_path))
+        assert "rendering 4 val samples" in caplog.text
+        caplog.clear()
+        assert_same_bits(val_set(make_datamodule(num_val=4, cache_dir=tmp_path, num_train=99)), first)
+        assert "rendering" not in caplog.text
+
+
+def test_the_test_set_is_another_than_the_validation_set(make_datamodule):
+    datamodule = make_datamodule(num_val=8, num_test=8)
+    datamodule.setup("validate")
+    datamodule.setup("test")
+    (val,), (test,) = datamodule.val_dataloader(), datamodule.test_dataloader()
+    assert (val["betas"] != test["betas"]).any(1).all()
+    assert (
+        val["noisy_keypoints_2d"] - val["keypoints_2d"] != test["noisy_keypoints_2d"] - test["keypoints_2d"]
+    ).any()
+
+
+def test_the_key_of_a_fixed_set_follows_everything_that_it_depends_on(make_datamodule):
+    changes = [
+        {},
+        {"num_val": 21},
+        {"pool_seed": 1},
+        {"eval_seed": 1},
+        {"num_points": 33},
+        {"heading": "uniform"},
+        {"distance_m": (1.5, 2.5)},
+        {"margin_px": 9},
+        {"depth_noise_m": 0.002},
+        {"keypoint_noise_px": 5.0},
+        {"renderer": "zbuffer"},
+        {"normals": "open3d"},
+        {"source": EmbeddedSource(jitter_deg=3.0)},
+        {"source": EmbeddedSource(max_beta=1.0)},
+    ]
+    keys = [make_datamodule(**change).fixed_key("val") for change in changes]
+    keys.append(make_datamodule().fixed_key("test"))
+    assert len(set(keys)) == len(keys)
+
+
+def test_the_key_of_a_fixed_set_does_not_follow_what_leaves_the_samples_alone(make_datamodule, tmp_path):
+    changes = [
+        {},
+        {"seed": 1},
+        {"num_train": 9},
+        {"batch_size": 2},
+        {"num_workers": 2},
+        {"cache_dir": tmp_path},
+    ]
+    assert len({make_datamodule(**change).fixed_key("val") for change in changes}) == 1
+
+
+# Training
+
+
+def test_training_batches_are_the_same_bits_with_and_without_a_worker(train_loader):
+    threads = torch.get_num_threads()
+    loaders = [train_loader(num_train=16, num_workers=num_workers) for num_workers in (0, 1)]
+    try:
+        torch.set_num_threads(2)
+        for epoch in (0, 1, 1):  # the worker lives on through the epochs
+            for plain, worked in zip(*(batches_of(loader, epoch) for loader in loaders)):
+                assert_same_bits(plain, worked)
+    finally:
+        torch.set_num_threads(threads)
+
+
+def test_epochs_differ_in_order_and_draws_and_a_resumed_epoch_equals_a_reached_one(train_loader):
+    loader = train_loader(num_train=8, batch_size=8)
+    epochs = [batches_of(loader, epoch, number=1)[0] for epoch in range(3)]
+    resumed = train_loader(num_train=8, batch_size=8)
+    assert_same_bits(batches_of(resumed, 2, number=1)[0], epochs[2])
+
+    one, other = epochs[:2]
+    assert sorted(one["sample_id"].tolist()) == sorted(other["sample_id"].tolist()) == list(range(8))
+    assert one["sample_id"].tolist() != other["sample_id"].tolist()
+    one, other = ({name: b[name][b["sample_id"].argsort()] for name in b} for b in (one, other))
+    assert torch.equal(one["betas"], other["betas"])
+    for name in ("points", "joints", "noisy_keypoints_2d"):
+        assert (one[name] != other[name]).flatten(1).any(1).all(), name
+
+
+@pytest.mark.parametrize(("seed", "pool_seed"), [(1, 0), (0, 1)])
+def test_training_follows_both_of_its_seeds(train_loader, seed, pool_seed):
+    batches = []
+    for seeds in ({}, {"seed": seed, "pool_seed": pool_seed}):
+        (batch,) = batches_of(train_loader(num_train=4, batch_size=4, **seeds), 0, number=1)
+        batches.append({name: batch[name][batch["sample_id"].argsort()] for name in batch})
+    assert torch.equal(batches[0]["betas"], batches[1]["betas"]) == (pool_seed == 0)
+    noises = [b["noisy_keypoints_2d"] - b["keypoints_2d"] for b in batches]
+    assert ((noises[0] - noises[1]).abs().median() < 1e-3) == (seed == 0)
+
+
+def test_the_last_incomplete_training_batch_is_dropped_but_not_the_only_one(train_loader):
+    for num_train, batch_size, expected in ((40, 16, 2), (40, 64, 1), (40, 40, 1)):
+        assert len(train_loader(num_train=num_train, batch_size=batch_size)) == expected
+
+
+def test_the_sampler_gives_every_index_once_with_its_epoch():
+    sampler = EpochSampler(50, seed=3)
+    orders = []
+    for epoch in (0, 1, 7):
+        sampler.set_epoch(epoch)
+        epochs, indices = zip(*sampler)
+        assert set(epochs) == {epoch}
+        assert sorted(indices) == list(range(50))
+        orders.append(indices)
+    assert len(set(orders)) == 3
+    assert len(sampler) == 50
+
+
+def test_the_trainer_finds_the_sampler_to_tell_it_the_epoch(train_loader):
+    loader = train_loader()
+    set_epoch(loader, 7)
+    assert next(iter(loader.batch_sampler))[0][0] == 7
+
+
+# The distribution of the samples (section 3.5.2 and the specification of the camera and the placement)
+
+
+def test_depths_places_and_headings_are_spread_as_specified(train_loader, body, kinect):
+    stats = pytest.importorskip("scipy.stats", reason="SciPy is not installed")
+    layer = SMPL(body)
+    pixels, headings, depths, shares = [], [], [], []
+    for batch in train_loader(num_train=160, batch_size=32, num_points=4):
+        output = layer(batch["pose"], batch["betas"])
+        vertices, joints = (points @ CAMERA_FROM_BODY.float().T for points in output)
+        meshes = vertices + (batch["joints"] - joints)[:, ROOT, None]
+        pixels.append(project(meshes, batch["camera"]))
+        forward = rotvec_to_rotmat(batch["pose"][:, :3])[:, :, 2]
+        headings.append(torch.atan2(forward[:, 1], forward[:, 0]))
+        for mesh in meshes.double().numpy():
+            centre = (mesh[:, 2].min() + mesh[:, 2].max()) / 2
+            assert 1.5 - 1e-4 < centre < 3.0 + 1e-4
+            nearest = centre + place(mesh, kinect, np.zeros(3))[2]
+            if nearest < 1.5 + 1e-4:  # this body fits everywhere
+                depths.append(centre)
+            # Where it stands between the left and the right limit of its depth.
+            here = {"distance_m": (centre, centre)}
+            left, right = (-place(mesh, kinect, np.array([x, 0.5, 0]), **here)[0] for x in (0, 1))
+            if left - right > 0.01:
+                shares.append(left / (left - right))
+
+    pixels, away = torch.cat(pixels), torch.cat(headings).abs()
+    assert pixels.min() > 8 - 1e-2
+    assert pixels[..., 0].max() < kinect.width - 1 - 8 + 1e-2
+    assert pixels[..., 1].max() < kinect.height - 1 - 8 + 1e-2
+    assert float((away <= math.pi / 4).float().mean()) == pytest.approx(0.62, abs=0.1)
+    assert float((away >= 3 * math.pi / 4).float().mean()) == pytest.approx(0.21, abs=0.09)
+    assert len(depths) > 100
+    assert stats.kstest(depths, stats.uniform(1.5, 1.5).cdf).pvalue > 0.01
+    assert len(shares) > 120
+    assert stats.kstest(shares, "uniform").pvalue > 0.01
+
+
+# Checks before anything expensive
+
+
+def test_a_missing_body_file_is_found_before_anything_is_rendered(make_datamodule, tmp_path):
+    datamodule = make_datamodule(body_path=tmp_path / "none.npz", cache_dir=tmp_path / "samples")
+    with pytest.raises(FileNotFoundError, match=r"none\.npz"):
+        datamodule.prepare_data()
+    assert not (tmp_path / "samples").exists()
+
+
+def test_poses_that_are_not_finite_are_found_before_anything_is_rendered(make_datamodule, source, tmp_path):
+    with np.load(source.path) as file:
+        poses, clip = file["poses"].astype(np.float32), file["clip"]
+    poses[17, 3] = np.nan
+    np.savez(tmp_path / "poses.npz", poses=poses, clip=clip)
+    datamodule = make_datamodule(
+        source=EmbeddedSource(path=tmp_path / "poses.npz"), cache_dir=tmp_path / "samples"
+    )
+    with pytest.raises(ValueError, match=r"poses: .*poses\.npz holds NaN or infinite values"):
+        datamodule.prepare_data()
+    assert not (tmp_path / "samples").exists()
+
+
+def test_an_unknown_estimator_of_normals_is_found_before_anything_is_rendered(make_datamodule):
+    with pytest.raises(ValueError, match="normals: expected 'window' or 'open3d', got 'pca'"):
+        make_datamodule(normals="pca").prepare_data()
+
+
+@pytest.mark.parametrize("split", ["train", "val", "test"])
+def test_a_split_without_samples_is_an_error_at_once(make_datamodule, split):
+    with pytest.raises(ValueError, match=f"num_{split}: expected at least 1 sample, got 0"):
+        make_datamodule(**{f"num_{split}": 0})
+
+
+def test_a_poses_heading_that_was_dropped_cannot_be_kept(make_datamodule):
+    with pytest.raises(ValueError, match="heading: these poses carry no heading of their own"):
+        make_datamodule(heading="source").setup("fit")
+
+
+def test_training_batches_before_setup_are_an_error(make_datamodule):
+    with pytest.raises(RuntimeError, match="has not been called"):
+        make_datamodule().train_dataloader()
+
+
+# Memory
+
+
+def resident_mb(pid):
+    with open(f"/proc/{pid}/statm") as file:
+        return int(file.read().split()[1]) * resource.getpagesize() / 2**20
+
+
+@pytest.mark.slow
+def test_a_workers_memory_does_not_grow(train_loader):
+    if not os.path.exists("/proc/self/statm"):
+        pytest.skip("needs /proc to read a process's memory")
+    batches = iter(train_loader(num_train=2480, batch_size=16, num_points=1024, num_workers=1))
+    (worker,) = batches._workers
+    for _ in range(30):
+        next(batches)
+    before = resident_mb(worker.pid)
+    for _ in batches:
+        after = resident_mb(worker.pid)
+    print(f"the worker's memory: {before:.1f} MB after 480 samples, {after:.1f} MB after 2480")
+    assert after - before < 50

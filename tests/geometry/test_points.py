@@ -1,0 +1,192 @@
+import numpy as np
+import pytest
+import torch
+
+from ljn.geometry.points import ball_group, distance_matrix, gather_points, squared_distances
+
+
+def draw(*shape, dtype=torch.float64, seed=0):
+    return torch.randn(*shape, dtype=dtype, generator=torch.Generator().manual_seed(seed))
+
+
+def naive_ball_group(points, centres, radii, group_size):
+    groups = np.empty((*centres.shape[:2], group_size), np.int64)
+    for b, cloud in enumerate(points.numpy()):
+        for m, (centre, radius) in enumerate(zip(centres[b].numpy(), radii.numpy())):
+            distances = [float(np.sqrt(((point - centre) ** 2).sum())) for point in cloud]
+            found = [i for i, distance in enumerate(distances) if distance <= radius]
+            if not found:
+                found = sorted(range(len(cloud)), key=distances.__getitem__)[:group_size]
+            for slot in range(group_size):
+                groups[b, m, slot] = found[slot % len(found)]
+    return groups
+
+
+# The distance matrix
+
+
+@pytest.mark.parametrize("shape", [(1,), (5,), (2, 7), (2, 3, 4)])
+def test_distance_matrix_equals_scipy(shape):
+    cdist = pytest.importorskip("scipy.spatial.distance", reason="SciPy is not installed").cdist
+    points = draw(*shape, 3)
+    flat = points.reshape(-1, shape[-1], 3).numpy()
+    expected = np.stack([cdist(cloud, cloud) for cloud in flat]).reshape(*shape, shape[-1])
+    np.testing.assert_allclose(distance_matrix(points).numpy(), expected, atol=1e-12)
+
+
+def test_distance_matrix_is_symmetric_with_an_exactly_zero_diagonal():
+    matrix = distance_matrix(draw(4, 6, 3, dtype=torch.float32))
+    assert matrix.dtype == torch.float32
+    assert torch.equal(matrix, matrix.mT)
+    assert (matrix.diagonal(dim1=-2, dim2=-1) == 0).all()
+
+
+def test_distance_matrix_does_not_feel_a_rigid_motion():
+    points = draw(6, 3)
+    rotation = torch.linalg.qr(draw(3, 3, seed=1)).Q
+    torch.testing.assert_close(distance_matrix(points @ rotation.T + 3.0), distance_matrix(points))
+
+
+def test_distance_matrix_has_a_zero_gradient_where_points_coincide():
+    points = torch.tensor([[0.0, 0, 0], [0, 0, 0], [1, 0, 0]], requires_grad=True)
+    distance_matrix(points)[:2, :2].sum().backward()
+    assert torch.equal(points.grad, torch.zeros(3, 3))
+
+
+def test_distance_matrix_has_finite_gradients_beside_coinciding_points():
+    points = torch.tensor([[0.0, 0, 0], [0, 0, 0], [1, 0, 0]], requires_grad=True)
+    distance_matrix(points).sum().backward()
+    # Each pair counts twice: along x, one pull from each of the two points at the origin.
+    torch.testing.assert_close(points.grad[:, 0], torch.tensor([-2.0, -2.0, 4.0]))
+
+
+def test_distance_matrix_passes_gradcheck():
+    assert torch.autograd.gradcheck(distance_matrix, (draw(2, 4, 3).requires_grad_(),))
+
+
+# Gathering
+
+
+@pytest.mark.parametrize("index_shape", [(5,), (4, 2), (2, 3, 2)])
+def test_gather_points_equals_a_loop(index_shape):
+    features = draw(3, 6, 4)
+    index = torch.randint(6, (3, *index_shape), generator=torch.Generator().manual_seed(1))
+    gathered = gather_points(features, index)
+    assert gathered.shape == (3, *index_shape, 4)
+    for b in range(3):
+        for place in np.ndindex(*index_shape):
+            assert torch.equal(gathered[b][place], features[b, index[b][place]])
+
+
+def test_gather_points_passes_gradients_to_each_taken_row_as_often_as_it_is_taken():
+    features = draw(2, 3, 2).requires_grad_()
+    gather_points(features, torch.tensor([[0, 0, 2], [1, 1, 1]])).sum().backward()
+    assert features.grad[..., 0].tolist() == [[2.0, 0.0, 1.0], [0.0, 3.0, 0.0]]
+
+
+# Squared distances
+
+
+def test_squared_distances_equal_a_loop():
+    centres, points = draw(2, 3, 3), draw(2, 5, 3, seed=1)
+    squared = squared_distances(centres, points)
+    for b, m, n in np.ndindex(2, 3, 5):
+        expected = float(((centres[b, m] - points[b, n]) ** 2).sum())
+        assert float(squared[b, m, n]) == pytest.approx(expected, rel=1e-14)
+
+
+def test_squared_distances_do_not_cancel_far_from_the_origin():
+    far = torch.tensor([[[1000.0, 1000.0, 1000.0]]])
+    near_by = far + torch.tensor([0.0, 0.0, 2**-12])
+    assert float(squared_distances(far, near_by)) == 2**-24
+
+
+def test_squared_distances_pass_gradcheck():
+    inputs = (draw(2, 3, 3).requires_grad_(), draw(2, 4, 3, seed=1).requires_grad_())
+    assert torch.autograd.gradcheck(squared_distances, inputs)
+
+
+# Ball grouping
+
+LINE = torch.stack([torch.arange(6.0), torch.zeros(6), torch.zeros(6)], -1)[None]  # x = 0 to 5
+
+
+def group_on_line(x, radius, group_size, order=range(6)):
+    centre = torch.tensor([[[x, 0.0, 0.0]]])
+    return ball_group(LINE[:, list(order)], centre, torch.tensor([radius]), group_size)[0, 0].tolist()
+
+
+def test_an_overfull_ball_gives_its_first_points_in_the_order_of_the_cloud():
+    assert group_on_line(2.0, 2.5, 3) == [0, 1, 2]
+    # Positions of the coordinates 4, 3 and 2: the first three of the cloud that lie inside.
+    assert group_on_line(2.0, 2.5, 3, order=[5, 4, 3, 2, 1, 0]) == [1, 2, 3]
+
+
+def test_a_ball_that_is_just_full_gives_each_point_once():
+    assert group_on_line(2.0, 1.5, 3) == [1, 2, 3]
+
+
+def test_an_underfull_ball_repeats_its_points_in_turn():
+    assert group_on_line(2.0, 1.5, 8) == [1, 2, 3, 1, 2, 3, 1, 2]
+
+
+def test_an_empty_ball_takes_the_nearest_points_of_all():
+    assert group_on_line(-3.0, 1.0, 3) == [0, 1, 2]
+    assert group_on_line(9.0, 1.0, 2) == [5, 4]
+
+
+def test_an_empty_ball_repeats_when_the_cloud_has_too_few_points():
+    assert group_on_line(-3.0, 1.0, 8) == [0, 1, 2, 3, 4, 5, 0, 1]
+
+
+def test_a_point_on_the_surface_of_the_ball_belongs_to_it():
+    assert group_on_line(2.0, 1.0, 3) == [1, 2, 3]
+
+
+def test_a_cloud_of_one_point_fills_every_group():
+    index = ball_group(torch.zeros(1, 1, 3), torch.tensor([[[0.0, 0, 0], [9, 9, 9]]]), torch.ones(2), 4)
+    assert index.tolist() == [[[0] * 4, [0] * 4]]
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("group_size", [1, 4, 16, 50])
+def test_ball_group_equals_a_loop_in_every_case_at_once(dtype, group_size):
+    points, centres = draw(2, 40, 3, dtype=dtype), draw(2, 6, 3, dtype=dtype, seed=1)
+    centres[:, 0] += 20  # empty
+    radii = torch.tensor([0.5, 0.05, 0.8, 1.2, 2.0, 9.0], dtype=dtype)
+    index = ball_group(points, centres, radii, group_size)
+    assert index.dtype == torch.int64
+    np.testing.assert_array_equal(index.numpy(), naive_ball_group(points, centres, radii, group_size))
+
+
+def test_ball_group_is_deterministic():
+    points, centres, radii = draw(2, 200, 3), draw(2, 9, 3, seed=1), torch.full((9,), 0.7)
+    first = ball_group(points, centres, radii, 16)
+    assert all(torch.equal(ball_group(points, centres, radii, 16), first) for _ in range(5))
+
+
+def test_without_an_overfull_ball_the_set_of_points_does_not_depend_on_their_order():
+    points, centres = draw(1, 60, 3), draw(1, 8, 3, seed=1)
+    centres[:, 0] += 20  # empty: the nearest, in any order
+    radii = torch.full((8,), 0.6, dtype=torch.float64)
+    assert (squared_distances(centres, points) <= 0.36).sum(-1).max() <= 16, "no ball is to be overfull"
+    order = torch.randperm(60, generator=torch.Generator().manual_seed(2))
+    straight = gather_points(points, ball_group(points, centres, radii, 16))[0]
+    shuffled = gather_points(points[:, order], ball_group(points[:, order], centres, radii, 16))[0]
+    for one, other in zip(straight.tolist(), shuffled.tolist()):
+        assert set(map(tuple, one)) == set(map(tuple, other))
+
+
+def test_ball_group_of_a_batch_equals_ball_groups_of_its_samples():
+    points, centres, radii = draw(3, 50, 3), draw(3, 4, 3, seed=1), torch.tensor([0.3, 0.5, 1.0, 2.0])
+    together = ball_group(points, centres, radii, 8)
+    for b in range(3):
+        assert torch.equal(ball_group(points[b : b + 1], centres[b : b + 1], radii, 8)[0], together[b])
+
+
+def test_ball_group_takes_inputs_that_need_gradients():
+    points = draw(1, 20, 3).requires_grad_()
+    index = ball_group(points, points[:, :2], torch.tensor([0.5, 0.5]), 4)
+    assert torch.equal(
+        index, ball_group(points.detach(), points[:, :2].detach(), torch.tensor([0.5, 0.5]), 4)
+    )

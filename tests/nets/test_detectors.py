@@ -1,0 +1,195 @@
+import pytest
+import torch
+
+from ljn.nets.basic_detector import BasicDetector
+from ljn.nets.joint_network import LocalJointNetwork
+from ljn.nets.yardsticks import MeanOffset, Ridge
+
+SIZES = {"local_channels": (6, 6), "global_channels": (6, 8, 10), "head_channels": (8, 6)}
+RADII = [0.3] * 24
+
+
+def joint_network(**changes):
+    return LocalJointNetwork(
+        **{"radii_m": RADII, "group_size": 8, "group_channels": (6, 8, 10), **SIZES, **changes}
+    )
+
+
+NETWORKS = {
+    "proposed": joint_network,
+    "no_edm": lambda **changes: joint_network(edm=False, **changes),
+    "basic": lambda **changes: BasicDetector(**SIZES, **changes),
+}
+
+
+@pytest.fixture(params=NETWORKS)
+def make(request):
+    torch.manual_seed(0)
+    return NETWORKS[request.param]
+
+
+def batch(size=3, num_points=40, dtype=torch.float32):
+    generator = torch.Generator().manual_seed(1)
+    points = torch.randn(size, num_points, 6, generator=generator, dtype=dtype) * 0.3
+    points[..., 2] += 2
+    joints = torch.randn(size, 24, 3, generator=generator, dtype=dtype) * 0.3
+    joints[..., 2] += 2
+    return points, joints
+
+
+def test_a_detector_gives_24_joints(make):
+    assert make()(*batch()).shape == (3, 24, 3)
+
+
+def test_every_parameter_gets_a_gradient(make):
+    net = make()
+    net(*batch()).square().sum().backward()
+    without = [name for name, p in net.named_parameters() if p.grad is None or not p.grad.any()]
+    assert without == []
+
+
+def test_the_prediction_moves_with_the_person(make):
+    net = make().double()
+    points, joints = batch(dtype=torch.float64)
+    shift = torch.tensor([0.4, -0.2, 0.9], dtype=torch.float64)
+    moved = torch.cat([points[..., :3] + shift, points[..., 3:]], -1)
+    torch.testing.assert_close(net(moved, joints + shift), net(points, joints) + shift)
+
+
+def test_the_order_of_the_points_does_not_matter_without_an_overfull_ball():
+    net = joint_network(group_size=64, radii_m=[0.5] * 24).double()
+    points, joints = batch(dtype=torch.float64)
+    order = torch.randperm(points.shape[1], generator=torch.Generator().manual_seed(2))
+    torch.testing.assert_close(net(points[:, order], joints), net(points, joints))
+
+
+def test_the_basic_detector_ignores_the_order_of_the_points():
+    net = NETWORKS["basic"]().double()
+    points, joints = batch(dtype=torch.float64)
+    torch.testing.assert_close(net(points.flip(1), joints), net(points, joints))
+
+
+def test_a_sample_does_not_depend_on_its_batch(make):
+    net = make().double()
+    points, joints = batch(dtype=torch.float64)
+    torch.testing.assert_close(net(points, joints)[1:2], net(points[1:2], joints[1:2]))
+
+
+def test_evaluation_is_deterministic(make):
+    net = make().eval()
+    assert torch.equal(net(*batch()), net(*batch()))
+
+
+@pytest.mark.parametrize("output", ["offset", "absolute"])
+def test_a_few_samples_can_be_overfitted(make, output):
+    net = make(output=output)
+    points, joints = batch(4)
+    target = joints + 0.1 * torch.randn(joints.shape, generator=torch.Generator().manual_seed(3))
+    optimizer = torch.optim.Adam(net.parameters(), lr=5e-3)
+    for _ in range(300):
+        optimizer.zero_grad()
+        loss = (net(points, joints) - target).square().sum(-1).sum(-1).mean()
+        loss.backward()
+        optimizer.step()
+    assert loss < 0.02 * 24 * 3 * 0.1**2
+
+
+def test_the_first_layer_equals_one_product_over_concatenated_inputs():
+    """A loop over joints and points, each point with its 1115-like input written out."""
+    net = joint_network(group_size=5).double()
+    points, joints = batch(2, dtype=torch.float64)
+    centre = points[..., :3].mean(1, keepdim=True)
+    points = torch.cat([points[..., :3] - centre, points[..., 3:]], -1)
+    joints = joints - centre
+    local, pooled = net.trunk(points)
+    out = net.regress(points, joints)
+    for b in range(2):
+        edm = torch.cdist(joints[b], joints[b])
+        for j in range(24):
+            inside = (points[b, :, :3] - joints[b, j]).norm(dim=-1) <= 0.3
+            chosen = inside.nonzero()[:5, 0]
+            if len(chosen) == 0:
+                chosen = (points[b, :, :3] - joints[b, j]).norm(dim=-1).argsort()[:5]
+            rows = [
+                torch.cat([(points[b, p, :3] - joints[b, j]) / 0.3, local[b, p], pooled[b], edm[j]])
+                for p in chosen
+            ]
+            hidden = torch.stack(rows)
+            slopes = [
+                net.first_activation,
+                *[m for m in net.group if hasattr(m, "weight") and m.weight.ndim == 1],
+            ]
+            linears = [net.first, *[m for m in net.group if m.weight.ndim == 3]]
+            slopes.append(net.group_activation)
+            for linear, slope in zip(linears, slopes):
+                hidden = torch.nn.functional.prelu(
+                    hidden @ linear.weight[j].T + linear.bias[j], slope.weight[j : j + 1]
+                )
+            feature = hidden.amax(0, keepdim=True)
+            for layer in net.head:
+                feature = (
+                    feature @ layer.weight[j].T + layer.bias[j]
+                    if layer.weight.ndim == 3
+                    else torch.nn.functional.prelu(feature, layer.weight[j : j + 1])
+                )
+            torch.testing.assert_close(out[b, j], feature[0])
+
+
+def test_sizes_of_the_thesis_give_1115_inputs():
+    net = LocalJointNetwork(RADII)
+    assert net.first.weight.shape == (24, 64, 1115)
+
+
+def test_a_radius_list_of_the_wrong_length_is_refused():
+    with pytest.raises(ValueError, match=r"radii_m: expected 24 positive numbers.*got 3"):
+        joint_network(radii_m=[0.2] * 3)
+
+
+def test_an_unknown_output_is_refused():
+    with pytest.raises(ValueError, match="output: expected one of offset, absolute, got 'relative'"):
+        BasicDetector(output="relative")
+
+
+def fit(yardstick, batches):
+    for points, initial, joints in batches:
+        yardstick.accumulate(points, initial, joints)
+    yardstick.solve()
+    return yardstick
+
+
+def yardstick_batches():
+    generator = torch.Generator().manual_seed(0)
+    for _ in range(20):
+        points, initial = (
+            torch.randn(16, 30, 6, generator=generator),
+            torch.randn(16, 24, 3, generator=generator),
+        )
+        noise = torch.randn(16, 24, 3, generator=generator)
+        yield points, initial, initial + torch.arange(72).view(24, 3) * 0.01 + 0.05 * noise
+
+
+def test_mean_offset_is_the_mean_over_all_batches():
+    batches = list(yardstick_batches())
+    yardstick = fit(MeanOffset(), batches)
+    offset = torch.cat([joints - initial for _, initial, joints in batches]).double().mean(0)
+    torch.testing.assert_close(yardstick.bias.view(24, 3), offset)
+    points, initial, _ = batches[0]
+    torch.testing.assert_close(yardstick(points, initial), (initial + offset).float())
+
+
+def test_ridge_equals_least_squares_over_all_batches():
+    batches = list(yardstick_batches())
+    yardstick = fit(Ridge(penalty=1e-9), batches)
+    inputs = torch.cat([(i - p[..., :3].mean(1, keepdim=True)).flatten(1) for p, i, _ in batches]).double()
+    inputs = torch.cat([inputs, torch.ones(len(inputs), 1, dtype=torch.float64)], -1)
+    targets = torch.cat([(joints - i).flatten(1) for _, i, joints in batches]).double()
+    expected = torch.linalg.lstsq(inputs, targets).solution
+    torch.testing.assert_close(yardstick.weight, expected[:-1], atol=1e-6, rtol=1e-6)
+    torch.testing.assert_close(yardstick.bias, expected[-1], atol=1e-6, rtol=1e-6)
+
+
+def test_the_penalty_shrinks_the_weights_but_not_the_bias():
+    batches = list(yardstick_batches())
+    yardstick = fit(Ridge(penalty=1e6), batches)
+    assert yardstick.weight.abs().max() < 1e-5
+    torch.testing.assert_close(yardstick.bias, fit(MeanOffset(), batches).bias, atol=1e-4, rtol=1e-4)

@@ -1,0 +1,58 @@
+import pytest
+import torch
+from torch import nn
+
+from ljn.nets.layers import (
+    StackedLinear,
+    StackedPReLU,
+    activate_and_pool,
+    perceptron,
+    stacked_perceptron,
+)
+
+
+def test_stacked_layers_equal_a_loop_over_the_joints():
+    torch.manual_seed(0)
+    stacked = stacked_perceptron(3, [5, 7, 2], last_activation=False).double()
+    x = torch.randn(3, 4, 5, dtype=torch.float64)
+    out = stacked(x)
+    for joint in range(3):
+        single = perceptron([5, 7, 2], last_activation=False).double()
+        single[0].weight.data = stacked[0].weight.data[joint]
+        single[0].bias.data = stacked[0].bias.data[joint]
+        single[1].weight.data = stacked[1].weight.data[joint : joint + 1]
+        single[2].weight.data = stacked[2].weight.data[joint]
+        single[2].bias.data = stacked[2].bias.data[joint]
+        torch.testing.assert_close(out[joint], single(x[joint]))
+
+
+def test_each_slice_is_initialised_like_a_linear_layer_of_its_own():
+    torch.manual_seed(0)
+    layer = StackedLinear(24, 400, 50)
+    bound = 400**-0.5
+    assert layer.weight.abs().max() <= bound
+    assert layer.weight.std(dim=(1, 2)).sub(bound / 3**0.5).abs().max() < 0.02 * bound
+    assert not torch.equal(layer.weight[0], layer.weight[1])
+
+
+@pytest.mark.parametrize("slope", [0.25, 0.0, -0.7, 1.5])
+def test_activating_after_pooling_equals_activating_before(slope):
+    torch.manual_seed(0)
+    activation = nn.PReLU(init=slope).double()
+    x = torch.randn(4, 9, 6, dtype=torch.float64, requires_grad=True)
+    pooled = activate_and_pool(x, activation, 1)
+    reference = activation(x).amax(1)
+    torch.testing.assert_close(pooled, reference)
+    weight = torch.randn_like(reference)
+    torch.testing.assert_close(
+        torch.autograd.grad((pooled * weight).sum(), x)[0],
+        torch.autograd.grad((reference * weight).sum(), x)[0],
+    )
+
+
+def test_activating_after_pooling_handles_slopes_of_both_signs_among_joints():
+    torch.manual_seed(0)
+    activation = StackedPReLU(3)
+    activation.weight.data = torch.tensor([0.3, -0.4, 2.0])
+    x = torch.randn(3, 4, 9, 6)
+    torch.testing.assert_close(activate_and_pool(x, activation, 2), activation(x).amax(2))

@@ -1,0 +1,264 @@
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+
+from ljn.geometry.camera import Camera
+from ljn.render import RENDERERS, get_renderer
+
+SMALL = Camera(fx=20.0, fy=22.0, cx=11.3, cy=8.6, width=24, height=18)
+# Pixel centres are exactly representable: (x, y, 1) falls on pixel (16 x + 8, 16 y + 8).
+EXACT = Camera(fx=16.0, fy=16.0, cx=8.0, cy=8.0, width=17, height=17)
+
+
+def render(vertices, faces, camera):
+    vertices, faces = torch.as_tensor(vertices), torch.as_tensor(np.asarray(faces))
+    return get_renderer("zbuffer")(vertices[None], faces, camera)[0].numpy()
+
+
+def pixel_rays(camera):
+    """Directions `(H, W, 3)` with z = 1 through the pixel centres: a hit's parameter is planar depth."""
+    u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
+    return np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)], -1)
+
+
+def naive_depth(vertices, faces, camera):
+    """Every pixel's ray against every triangle, in float64 (Cramer's rule)."""
+    rays = pixel_rays(camera)
+    depth = np.zeros(rays.shape[:2])
+    for row, column in np.ndindex(*depth.shape):
+        nearest = np.inf
+        for a, b, c in vertices[np.asarray(faces)]:
+            system = np.stack([rays[row, column], a - b, a - c], -1)
+            if np.linalg.det(system) == 0:
+                continue
+            t, s, r = np.linalg.solve(system, a)
+            if t > 0 and min(s, r, 1 - s - r) >= 0:
+                nearest = min(nearest, t)
+        depth[row, column] = nearest if np.isfinite(nearest) else 0
+    return depth
+
+
+def convex_depth(vertices, faces, camera):
+    """Rays against a convex solid as an intersection of half spaces: knows nothing of edges."""
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    normals = np.cross(b - a, c - a)
+    normals *= np.sign(((a - vertices.mean(0)) * normals).sum(-1))[:, None]  # outwards
+    slope, offset = pixel_rays(camera) @ normals.T, (normals * a).sum(-1)  # inside: slope * t <= offset
+    enter = np.where(slope < 0, offset / slope, -np.inf).max(-1)
+    leave = np.where(slope > 0, offset / slope, np.inf).min(-1)
+    return np.where(enter < leave, enter, 0.0)
+
+
+def icosphere(subdivisions, radius, centre):
+    golden = (1 + 5**0.5) / 2
+    vertices = [(-1, golden, 0), (1, golden, 0), (-1, -golden, 0), (1, -golden, 0)]
+    vertices = np.array([np.roll(vertex, shift) for shift in range(3) for vertex in vertices])
+    gaps = np.linalg.norm(vertices[:, None] - vertices, axis=-1).round(6)
+    faces = [
+        (i, j, k)
+        for i in range(12)
+        for j in range(i + 1, 12)
+        for k in range(j + 1, 12)
+        if gaps[i, j] == gaps[j, k] == gaps[i, k] == 2
+    ]
+    triangles = vertices[np.array(faces)]  # (F, 3, 3)
+    for _ in range(subdivisions):
+        a, b, c = triangles.swapaxes(0, 1)
+        ab, bc, ca = (a + b) / 2, (b + c) / 2, (c + a) / 2
+        parts = [(a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)]
+        triangles = np.concatenate([np.stack(part, 1) for part in parts])
+    corners = triangles.reshape(-1, 3)
+    corners = radius * corners / np.linalg.norm(corners, axis=-1, keepdims=True)
+    _, first, index = np.unique(corners.round(9), axis=0, return_index=True, return_inverse=True)
+    return corners[first] + centre, index.reshape(-1, 3)
+
+
+def grid_faces(columns, rows):
+    corner = np.arange((rows - 1) * columns).reshape(rows - 1, columns)[:, :-1].ravel()
+    upper = np.stack([corner, corner + 1, corner + columns], -1)
+    lower = np.stack([corner + 1, corner + columns + 1, corner + columns], -1)
+    return np.concatenate([upper, lower])
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_depth_equals_rays_against_triangles_of_either_side(seed):
+    rng = np.random.default_rng(seed)
+    vertices = rng.uniform((-0.8, -0.6, 0.9), (0.8, 0.6, 3.0), (12, 3))
+    faces = np.stack([rng.choice(12, 3, replace=False) for _ in range(8)])
+    expected = naive_depth(vertices, faces, SMALL)
+    depth = render(vertices, faces, SMALL)
+    assert depth.dtype == np.float32
+    assert (expected > 0).sum() > 50
+    np.testing.assert_array_equal(depth > 0, expected > 0)
+    np.testing.assert_allclose(depth, expected, rtol=1e-6)
+
+
+@pytest.mark.parametrize("subdivisions", [0, 2, 3])
+def test_a_closed_surface_has_no_holes(subdivisions):
+    camera = Camera(fx=150.0, fy=150.0, cx=63.7, cy=64.2, width=128, height=128)
+    vertices, faces = icosphere(subdivisions, 0.6, (0.05, -0.03, 2.0))
+    assert len(vertices) == 10 * 4**subdivisions + 2
+    expected = convex_depth(vertices, faces, camera)
+    depth = render(vertices, faces, camera)
+    assert (depth > 0).sum() > 4000
+    np.testing.assert_array_equal(depth > 0, expected > 0)
+    np.testing.assert_allclose(depth, expected, rtol=1e-6)
+
+
+def test_edges_and_corners_exactly_through_pixel_centres_leave_no_gap():
+    x, y = np.meshgrid(np.arange(2, 13) / 16 - 0.5, np.arange(3, 12) / 16 - 0.5)
+    vertices = np.stack([x, y, np.ones(x.shape)], -1).reshape(-1, 3)
+    depth = render(vertices, grid_faces(11, 9), EXACT)
+    expected = np.zeros((17, 17))
+    expected[3:12, 2:13] = 1.0
+    np.testing.assert_array_equal(depth, expected)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_edges_within_rounding_of_pixel_centres_leave_no_gap(seed):
+    rng = np.random.default_rng(seed)
+    x, y = np.meshgrid(np.arange(1, 16) / 16 - 0.5, np.arange(1, 16) / 16 - 0.5)
+    z = rng.uniform(1.0, 1.2, x.shape)
+    vertices = np.stack([x * z, y * z, z], -1).reshape(-1, 3)  # back on the same pixels but for rounding
+    depth = render(vertices, grid_faces(15, 15), EXACT)
+    np.testing.assert_allclose(depth[2:15, 2:15], z[1:-1, 1:-1], rtol=1e-6)
+
+
+def test_a_fan_of_triangles_around_a_pixel_centre_covers_it():
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        angles = np.sort(rng.uniform(0, 2 * np.pi, 7))
+        if np.diff(angles, append=angles[0] + 2 * np.pi).max() > 3:
+            continue
+        rim = np.stack([0.3 * np.cos(angles), 0.3 * np.sin(angles), np.ones(7)], -1)
+        vertices = np.concatenate([[[0.0, 0.0, 1.0]], rim])
+        faces = [(0, 1 + i, 1 + (i + 1) % 7) for i in range(7)]
+        assert render(vertices, faces, EXACT)[8, 8] == 1.0
+
+
+def test_triangles_thinner_than_rounding_are_no_error():
+    rng = np.random.default_rng(0)
+    camera = Camera(fx=1.0, fy=1.0, cx=0.0, cy=0.0, width=6, height=6)
+    u = rng.uniform(0, 4, (20_000, 3))
+    v = np.nextafter(u, rng.choice([-9.0, 9.0], u.shape))
+    vertices = np.stack([u, v, np.ones(u.shape)], -1).reshape(-1, 3)
+    depth = render(vertices, np.arange(60_000).reshape(-1, 3), camera)
+    assert set(np.unique(depth)) <= {0.0, 1.0}
+
+
+def test_a_triangle_without_area_draws_nothing():
+    vertices = np.array([[-0.3, -0.3, 1.0], [0.3, 0.3, 1.0], [0.0, 0.0, 1.0]])
+    assert not render(vertices, [(0, 1, 2), (0, 1, 1), (2, 2, 2)], EXACT).any()
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_depth_of_a_plane_across_the_axis_is_exact(dtype):
+    z = 1.7
+    vertices = torch.tensor([[-9, -9, z], [9, -9, z], [9, 9, z], [-9, 9, z]], dtype=dtype)
+    depth = render(vertices, [(0, 1, 2), (0, 2, 3)], SMALL)
+    assert (depth == np.float32(z)).all()
+
+
+def test_depth_is_planar_depth_on_a_tilted_plane():
+    # z = 2 + x / 2 on every ray.
+    corners = [(x, y, 2 + x / 2) for x, y in ((-2, -2), (2, -2), (2, 2), (-2, 2))]
+    slope = pixel_rays(SMALL)[..., 0]
+    depth = render(np.array(corners, np.float64), [(0, 1, 2), (0, 2, 3)], SMALL)
+    np.testing.assert_allclose(depth, 2 / (1 - slope / 2), rtol=1e-6)
+
+
+def test_the_nearer_surface_hides_the_farther_in_either_order():
+    far = np.array([[-9, -9, 3.0], [9, -9, 3.0], [0, 9, 3.0]])
+    near = far * (1, 1, 0.5)
+    for first, second in ((near, far), (far, near)):
+        depth = render(np.concatenate([first, second]), [(0, 1, 2), (3, 4, 5)], SMALL)
+        assert depth[8, 11] == 1.5
+
+
+def test_a_triangle_partly_outside_the_image_is_clipped():
+    vertices = np.array([[-3.0, 0.1, 1.4], [0.2, -2.5, 1.8], [2.5, 1.9, 2.2]])
+    expected = naive_depth(vertices, [(0, 1, 2)], SMALL)
+    depth = render(vertices, [(0, 1, 2)], SMALL)
+    assert 0 < (depth > 0).sum() < depth.size
+    np.testing.assert_array_equal(depth > 0, expected > 0)
+    np.testing.assert_allclose(depth, expected, rtol=1e-6)
+
+
+def test_a_mesh_outside_the_image_draws_nothing():
+    vertices = np.array([[5.0, 0, 1], [6.0, 0, 1], [5.0, 1, 1]])
+    assert not render(vertices, [(0, 1, 2)], SMALL).any()
+    assert not render(vertices * (-1, 1, 1), [(0, 1, 2)], SMALL).any()
+
+
+def test_a_batch_equals_its_meshes_rendered_alone(bodies, kinect):
+    vertices, faces = torch.from_numpy(bodies[0][:3]) + torch.tensor([0.0, 0.0, 2.5]), bodies[1]
+    renderer = get_renderer("zbuffer")
+    together = renderer(vertices, faces, kinect)
+    assert together.shape == (3, kinect.height, kinect.width)
+    for mesh, depth in zip(vertices, together):
+        assert torch.equal(renderer(mesh[None], faces, kinect)[0], depth)
+
+
+def test_an_empty_batch_gives_an_empty_batch(bodies, kinect):
+    depth = get_renderer("zbuffer")(torch.zeros(0, 6890, 3), bodies[1], kinect)
+    assert depth.shape == (0, kinect.height, kinect.width)
+
+
+def test_another_camera_gives_another_image_of_its_own_size(bodies, kinect):
+    vertices, faces = torch.from_numpy(bodies[0][:1]) + torch.tensor([0.0, 0.0, 3.0]), bodies[1]
+    half = Camera(kinect.fx / 2, kinect.fy / 2, kinect.cx / 2, kinect.cy / 2, 212, 256)
+    large = get_renderer("zbuffer")(vertices, faces, kinect)
+    small = get_renderer("zbuffer")(vertices, faces, half)
+    assert small.shape == (1, 256, 212)
+    # Pixel (u, v) of the small image has the ray of (2u, 2v) of the large one.
+    assert torch.equal(small > 0, large[:, ::2, ::2] > 0)
+    torch.testing.assert_close(small, large[:, ::2, ::2])
+
+
+def test_meshes_that_need_gradients_can_be_drawn():
+    vertices = torch.tensor([[[-9.0, -9, 2], [9, -9, 2], [0, 9, 2]]], requires_grad=True)
+    assert get_renderer()(vertices, torch.tensor([[0, 1, 2]]), SMALL).max() == 2
+
+
+@pytest.mark.parametrize("z", [0.0, -1.0])
+def test_a_vertex_not_in_front_of_the_camera_is_an_error(z):
+    vertices = np.array([[0, 0, 1.0], [1, 0, 1.0], [0, 1, z]])
+    with pytest.raises(
+        ValueError, match=rf"vertices: the nearest has a depth of {z:.3f} m.*in front of the camera"
+    ):
+        render(vertices, [(0, 1, 2)], SMALL)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_a_vertex_that_is_not_finite_is_an_error(value):
+    vertices = np.array([[0, 0, 1.0], [1, 0, 1.0], [0, value, 1]])
+    with pytest.raises(ValueError, match="vertices: NaN or infinite values"):
+        render(vertices, [(0, 1, 2)], SMALL)
+
+
+def test_vertices_without_a_batch_dimension_are_an_error():
+    with pytest.raises(ValueError, match=r"vertices: expected \(B, V, 3\), got \(4, 3\)"):
+        get_renderer("zbuffer")(torch.ones(4, 3), torch.tensor([[0, 1, 2]]), SMALL)
+
+
+def test_an_unknown_renderer_is_an_error_that_names_the_known_ones():
+    with pytest.raises(ValueError, match="renderer: expected one of auto, zbuffer, open3d, got 'opengl'"):
+        get_renderer("opengl")
+    assert RENDERERS[0] == "auto"
+
+
+def test_auto_is_the_z_buffer():
+    assert type(get_renderer("auto")) is type(get_renderer("zbuffer"))
+
+
+def test_importing_the_package_loads_nothing_heavy():
+    code = (
+        "import sys; import ljn, ljn.render\n"
+        "loaded = {'numba', 'open3d', 'pyrender', 'wandb'} & set(sys.modules)\n"
+        "assert not loaded, loaded"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr

@@ -1,0 +1,73 @@
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from hydra import compose, initialize_config_dir
+
+from ljn.tasks.schema import register
+
+ROOT = Path(__file__).parents[2]
+SMOKE = ("preset=smoke", "logger=csv", "data.num_workers=0")
+
+
+@pytest.fixture(autouse=True)
+def keep_num_threads():
+    """Tasks set the number of threads; other tests should not notice."""
+    before = torch.get_num_threads()
+    yield
+    torch.set_num_threads(before)
+
+
+@pytest.fixture(scope="session")
+def compose_config():
+    """Compose a configuration as run.py does, from overrides."""
+    register()
+
+    def make(*overrides, return_hydra_config=False):
+        with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
+            return compose("config", list(overrides), return_hydra_config=return_hydra_config)
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def smoke_config(compose_config):
+    """A configuration that trains in seconds, writing below a directory."""
+
+    def make(directory, *overrides):
+        return compose_config(*SMOKE, f"paths.output_dir={directory}", *overrides)
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def run_py():
+    """Call run.py as a user does; returns the finished process."""
+
+    def call(*arguments, check=True, timeout=300):
+        done = subprocess.run(
+            [sys.executable, "run.py", *arguments],
+            cwd=ROOT,
+            capture_output=True,
+            text=True,
+            timeout=timeout,
+            env=os.environ | {"OMP_NUM_THREADS": "1", "WANDB_MODE": "offline"},
+        )
+        assert not check or done.returncode == 0, done.stdout + done.stderr
+        return done
+
+    return call
+
+
+@pytest.fixture(scope="session")
+def trained(smoke_config, tmp_path_factory):
+    """A finished smoke run: its metrics and its directory."""
+    from ljn.tasks.train import train
+
+    directory = tmp_path_factory.mktemp("trained")
+    cfg = smoke_config(directory, "experiment=detector/proposed")
+    metrics = train(cfg)
+    return metrics, Path(cfg.paths.run_dir)

@@ -1,0 +1,152 @@
+import re
+from pathlib import Path
+
+import pytest
+from hydra.errors import ConfigCompositionException
+from omegaconf import OmegaConf, open_dict
+from omegaconf.errors import OmegaConfBaseException
+
+from ljn.tasks.building import build, build_each, check_targets
+from ljn.tasks.validation import check_writable, validate
+
+CONF = Path(__file__).parents[2] / "conf"
+GROUPS = sorted(
+    f"{path.parent.relative_to(CONF)}={path.stem}"
+    for path in CONF.rglob("*.yaml")
+    if path.parent != CONF and path.parts[-2] not in ("hydra", "local", "detector")
+)
+EXPERIMENTS = sorted(
+    f"experiment={path.relative_to(CONF / 'experiment').with_suffix('')}"
+    for path in (CONF / "experiment").rglob("*.yaml")
+)
+
+
+@pytest.mark.parametrize("choice", GROUPS + EXPERIMENTS)
+def test_every_config_composes_validates_and_builds(choice, compose_config, tmp_path):
+    overrides = [choice, f"paths.output_dir={tmp_path}"]
+    if choice.startswith("model=") and choice.split("=")[1] in ("ridge", "mean_offset"):
+        overrides.append("module=yardstick")
+    if choice == "module=yardstick":
+        overrides.append("model=ridge")
+    cfg = compose_config(*overrides, return_hydra_config=True)
+    with open_dict(cfg):
+        del cfg["hydra"]
+        cfg.paths.run_dir = str(tmp_path)
+    validate(cfg)
+    build(cfg.data)
+    build(cfg.module)
+    build(cfg.trainer, logger=build_each(cfg.logger), callbacks=build_each(cfg.callbacks))
+
+
+def test_every_experiment_opens_with_the_command_that_runs_it():
+    for choice in EXPERIMENTS:
+        name = choice.removeprefix("experiment=")
+        text = (CONF / "experiment" / f"{name}.yaml").read_text()
+        assert text.startswith(f"# @package _global_\n# python run.py experiment={name}\n"), name
+        assert re.search(rf"^name: {name}$", text, re.MULTILINE), name
+
+
+def test_presets_have_the_same_keys():
+    presets = {path.stem: OmegaConf.load(path) for path in (CONF / "preset").glob("*.yaml")}
+    keys = {name: sorted(preset) for name, preset in presets.items()}
+    assert len({tuple(value) for value in keys.values()}) == 1, keys
+
+
+def test_the_thesis_preset_holds_the_specs_numbers(compose_config):
+    cfg = compose_config("preset=thesis", "experiment=detector/proposed")
+    assert (cfg.data.num_points, cfg.data.num_train, cfg.data.num_val, cfg.data.num_test) == (
+        4096,
+        60000,
+        5000,
+        15000,
+    )
+    assert cfg.model.group_size == 128
+    assert cfg.module.optimizer._target_ == "torch.optim.RAdam"
+    assert (cfg.module.scheduler.step_size, cfg.module.scheduler.gamma) == (5, 0.1)
+    assert cfg.data.normals == "open3d"
+
+
+def test_a_misspelt_key_is_rejected(compose_config):
+    with pytest.raises(ConfigCompositionException, match=r"num_pionts"):
+        compose_config("data.num_pionts=3")
+
+
+def test_a_value_of_the_wrong_type_is_rejected(compose_config):
+    with pytest.raises(ConfigCompositionException, match=r"seed"):
+        compose_config("seed=many")
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (
+            ["model.radii_m=[0.2,0.3]"],
+            r"model\.radii_m: expected 24 radii, one for each joint \(pelvis.*got 2",
+        ),
+        (["data.num_points=0"], r"data\.num_points: expected a positive integer, got 0"),
+        (["callbacks.best.monitor=val/mjpe"], r"callbacks\.best\.monitor: no metric 'val/mjpe'.*val/mpjpe"),
+        (["model._target_=os.system"], r"model: `_target_: os\.system` is outside the modules"),
+        (
+            ["paths.output_dir=/dev/null/x"],
+            r"paths\.output_dir: cannot write in '/dev/null/x'.*choose another",
+        ),
+    ],
+)
+def test_what_types_cannot_say_is_validated(overrides, message, compose_config, tmp_path):
+    cfg = compose_config(f"paths.output_dir={tmp_path}", *overrides)
+    with pytest.raises(ValueError, match=message):
+        validate(cfg)
+
+
+def test_several_processes_in_a_multirun_are_refused(compose_config, tmp_path):
+    cfg = compose_config(f"paths.output_dir={tmp_path}", "trainer.devices=2")
+    validate(cfg)
+    with pytest.raises(
+        ValueError, match=r"several processes .* do not go with a multirun.*trainer\.devices=1"
+    ):
+        validate(cfg, is_multirun=True)
+
+
+def test_a_directory_below_a_file_cannot_be_written(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ValueError, match="cannot write"):
+        check_writable(tmp_path / "file" / "outputs")
+
+
+@pytest.mark.parametrize(
+    "target",
+    [
+        "os.system",
+        "builtins.eval",
+        "torch.load",
+        "subprocess.run",
+        "ljn.tasks.records.subprocess.run",
+        "ljn.tasks.train.os.system",
+        "datamodules.cache.shutil.rmtree",
+        "lightning.pytorch.trainer.trainer.os.system",
+        "torch.optim.optimizer.torch.load",
+        "ljn.nets.layers.no_such_thing",
+    ],
+)
+def test_a_target_cannot_reach_code_outside_the_allow_list(target):
+    with pytest.raises(ValueError, match="_target_"):
+        check_targets({"module": {"net": [{"_target_": target}]}})
+
+
+def test_an_error_in_a_constructor_keeps_its_type_and_message(compose_config):
+    cfg = compose_config("data.heading=sideways")
+    with pytest.raises(
+        ValueError, match="heading: expected one of source, histogram, uniform, got 'sideways'"
+    ):
+        build(cfg.data)
+
+
+def test_no_config_reaches_an_object(compose_config):
+    from omegaconf import DictConfig, ListConfig
+
+    cfg = compose_config("experiment=detector/proposed")
+    module = build(cfg.module)
+    datamodule = build(cfg.data)
+    for owner in (module, module.net, datamodule, datamodule.settings, datamodule.source):
+        for name, value in vars(owner).items():
+            assert not isinstance(value, DictConfig | ListConfig), name

@@ -1,0 +1,157 @@
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from ljn.body.files import load_body_model
+from ljn.tasks.checkpoints import read_checkpoint
+from ljn.tasks.evaluate import evaluate, with_checkpoint_config
+
+
+def evaluation(smoke_config, trained, tmp_path, *overrides, ckpt_path=None):
+    checkpoint = trained[1] / "checkpoints" / "best.ckpt"
+    return smoke_config(tmp_path, "task=evaluate", f"ckpt_path={ckpt_path or checkpoint}", *overrides)
+
+
+def test_another_process_with_other_workers_gives_exactly_the_metrics_of_training(trained, run_py, tmp_path):
+    metrics, run_dir = trained
+    run_py(
+        *(
+            "task=evaluate",
+            f"ckpt_path={run_dir / 'checkpoints' / 'best.ckpt'}",
+            f"paths.output_dir={tmp_path}",
+        ),
+        *("data.num_workers=2", "logger=csv"),
+    )
+    [evaluated] = (tmp_path / "evaluations").iterdir()
+    assert json.loads((evaluated / "metrics.json").read_text()) == metrics
+    record = json.loads((evaluated / "record.json").read_text())
+    assert record["trained_by"] == run_dir.name
+    assert record["status"] == "complete"
+
+
+def test_several_checkpoints_go_in_one_multirun_with_other_noise(trained, run_py, tmp_path):
+    _, run_dir = trained
+    other = edited(trained, tmp_path, lambda content: content["state_dict"]["net.head.4.bias"].add_(0.1))
+    checkpoints = [run_dir / "checkpoints" / "best.ckpt", other]
+    run_py(
+        *(
+            "-m",
+            "task=evaluate",
+            f"ckpt_path={checkpoints[0]},{checkpoints[1]}",
+            f"paths.output_dir={tmp_path}",
+        ),
+        *("data.keypoint_noise_px=15", "logger=csv"),
+    )
+    evaluated = list((tmp_path / "evaluations").iterdir())
+    assert len(evaluated) == 2
+    for directory in evaluated:
+        metrics = json.loads((directory / "metrics.json").read_text())
+        assert metrics["test/initial_mean_distance_px"] == pytest.approx(15 * np.sqrt(np.pi / 2), rel=0.1)
+
+
+def test_an_evaluation_needs_a_checkpoint(smoke_config, tmp_path):
+    with pytest.raises(ValueError, match="ckpt_path: expected the checkpoint to evaluate, got null"):
+        evaluate(smoke_config(tmp_path, "task=evaluate"))
+    with pytest.raises(FileNotFoundError, match=r"no file 'nowhere\.ckpt'"):
+        evaluate(smoke_config(tmp_path, "task=evaluate", "ckpt_path=nowhere.ckpt"))
+
+
+def test_a_truncated_checkpoint_is_an_error(trained, smoke_config, tmp_path):
+    content = (trained[1] / "checkpoints" / "best.ckpt").read_bytes()
+    for share in (0.0, 0.5, 0.99):
+        (tmp_path / "cut.ckpt").write_bytes(content[: int(share * len(content))])
+        with pytest.raises(ValueError, match="damaged, truncated or no checkpoint at all"):
+            evaluate(evaluation(smoke_config, trained, tmp_path, ckpt_path=tmp_path / "cut.ckpt"))
+
+
+def test_a_foreign_checkpoint_is_an_error(trained, smoke_config, tmp_path):
+    torch.save({"state_dict": {}, "epoch": 3}, tmp_path / "foreign.ckpt")
+    with pytest.raises(ValueError, match="no checkpoint that a run of this library wrote"):
+        evaluate(evaluation(smoke_config, trained, tmp_path, ckpt_path=tmp_path / "foreign.ckpt"))
+
+
+def edited(trained, tmp_path, edit):
+    content = torch.load(trained[1] / "checkpoints" / "best.ckpt", weights_only=True)
+    edit(content)
+    torch.save(content, tmp_path / "edited.ckpt")
+    return tmp_path / "edited.ckpt"
+
+
+def test_weights_of_another_model_are_an_error(trained, smoke_config, tmp_path):
+    path = edited(trained, tmp_path, lambda content: content["ljn"]["config"]["model"].update(edm=False))
+    # The stored config is resolved: the module's copy of the network is what is built.
+    path = edited(
+        trained, tmp_path, lambda content: content["ljn"]["config"]["module"]["net"].update(edm=False)
+    )
+    with pytest.raises(ValueError, match=r"weights of another model.*'net\.first\.weight'"):
+        evaluate(evaluation(smoke_config, trained, tmp_path, ckpt_path=path))
+
+
+def test_a_newer_checkpoint_is_an_error(trained, smoke_config, tmp_path):
+    path = edited(trained, tmp_path, lambda content: content["ljn"].update(version=99))
+    with pytest.raises(ValueError, match="written by a newer version"):
+        evaluate(evaluation(smoke_config, trained, tmp_path, ckpt_path=path))
+
+
+def test_code_named_by_a_checkpoint_is_refused(trained, smoke_config, tmp_path):
+    def edit(content):
+        content["ljn"]["config"]["module"]["net"] = {
+            "_target_": "os.system",
+            "command": f"touch {tmp_path / 'ran'}",
+        }
+
+    with pytest.raises(ValueError, match="checkpoint's config.*os.system"):
+        evaluate(evaluation(smoke_config, trained, tmp_path, ckpt_path=edited(trained, tmp_path, edit)))
+    assert not (tmp_path / "ran").exists()
+
+
+def test_a_checkpoint_of_another_body_is_an_error(trained, smoke_config, tmp_path):
+    path = edited(trained, tmp_path, lambda content: content["ljn"].update(body_hash="0123456789abcdef"))
+    with pytest.raises(ValueError, match=r"trained with the body 0123456789abcdef, this is .*body\.path"):
+        evaluate(evaluation(smoke_config, trained, tmp_path, ckpt_path=path))
+
+
+def test_overrides_change_data_and_nothing_that_the_checkpoint_decides(trained, smoke_config, tmp_path):
+    checkpoint = read_checkpoint(trained[1] / "checkpoints" / "best.ckpt")
+    cfg = evaluation(smoke_config, trained, tmp_path)
+    merged = with_checkpoint_config(
+        cfg, checkpoint, ["task=evaluate", "data.keypoint_noise_px=15", "logger=csv"]
+    )
+    assert merged.data.keypoint_noise_px == 15
+    assert merged.data.num_points == 128
+    for override in (
+        "model.edm=false",
+        "preset=thesis",
+        "experiment=detector/basic",
+        "data=synthetic",
+        "seed=3",
+    ):
+        with pytest.raises(ValueError, match="come from the checkpoint"):
+            with_checkpoint_config(cfg, checkpoint, [override])
+    with pytest.raises(ValueError, match=r"no key 'data\.num_pionts'; known there: .*num_points"):
+        with_checkpoint_config(cfg, checkpoint, ["data.num_pionts=3"])
+
+
+def test_the_body_can_be_given_as_another_file_with_the_same_content(trained, run_py, tmp_path):
+    body = load_body_model()
+    np.savez(
+        tmp_path / "copy.npz",
+        v_template=body.v_template,
+        shapedirs=body.shapedirs,
+        posedirs=body.posedirs,
+        J_regressor=body.J_regressor,
+        weights=body.weights,
+        f=body.faces,
+        kintree_table=np.load(body.path)["kintree_table"],
+    )
+    done = run_py(
+        *(
+            "task=evaluate",
+            f"ckpt_path={trained[1] / 'checkpoints' / 'best.ckpt'}",
+            f"paths.output_dir={tmp_path}",
+        ),
+        *(f"body.path={tmp_path / 'copy.npz'}", "logger=csv"),
+    )
+    assert f"{trained[0]['test/mpjpe']:10.3f}" in done.stdout

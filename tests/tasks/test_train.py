@@ -1,0 +1,233 @@
+import csv
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from lightning.pytorch import Callback
+from omegaconf import OmegaConf
+
+from ljn.tasks import train as train_task
+from ljn.tasks.train import train
+
+ROOT = Path(__file__).parents[2]
+KEYS = {
+    "test/mpjpe",
+    "test/mpjpe_eq38",
+    "test/mpjpe_root_aligned",
+    "test/mpjpe_procrustes",
+    "test/pckh",
+    "test/pckh_threshold_mm",
+    "test/initial_mpjpe",
+    "test/initial_mean_distance_px",
+    "test/initial_max_distance_px",
+}
+
+
+def weights(run_dir):
+    return torch.load(run_dir / "checkpoints" / "last.ckpt", weights_only=True)["state_dict"]
+
+
+def test_a_run_leaves_its_files(trained):
+    metrics, run_dir = trained
+    assert set(metrics) == KEYS
+    assert json.loads((run_dir / "metrics.json").read_text()) == metrics
+    record = json.loads((run_dir / "record.json").read_text())
+    assert record["status"] == "complete"
+    assert record["config_hash"] == run_dir.name.rpartition("-")[2]
+    assert record["data"]["sizes"] == {"train": 32, "val": 16, "test": 16}
+    assert record["data"]["body"]["hash"]
+    assert record["data"]["seeds"] == {"seed": 0, "pool_seed": 0, "eval_seed": 0}
+    assert OmegaConf.load(run_dir / "config.yaml").data.num_points == 128
+    assert (run_dir / "checkpoints" / "best.ckpt").is_file()
+    assert sorted(path.name for path in (run_dir / "pictures").iterdir()) == [
+        "test_best_median_worst.png",
+        "val_epoch_001.png",
+        "val_epoch_002.png",
+    ]
+    with (run_dir / "csv" / "version_0" / "metrics.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert len([row for row in rows if row["val/mpjpe"]]) == 2
+
+
+def test_sample_errors_give_the_metrics_again(trained):
+    metrics, run_dir = trained
+    with np.load(run_dir / "test_errors.npz") as errors:
+        assert errors["errors_mm"].shape == (16, 24)
+        assert errors["errors_mm"].mean() == pytest.approx(metrics["test/mpjpe"], rel=1e-5)
+        assert errors["initial_errors_mm"].mean() == pytest.approx(metrics["test/initial_mpjpe"], rel=1e-5)
+        distance = np.linalg.norm(errors["pred_joints"] - errors["joints"], axis=-1)
+        np.testing.assert_allclose(1000 * distance, errors["errors_mm"], rtol=1e-4)
+
+
+def test_a_complete_run_is_not_trained_again(trained, smoke_config, monkeypatch):
+    metrics, run_dir = trained
+    monkeypatch.setattr(train_task, "build_trainer", lambda *_: pytest.fail("trained again"))
+    cfg = smoke_config(run_dir.parents[1], "experiment=detector/proposed", "data.num_workers=1")
+    assert train(cfg) == metrics
+
+
+def test_the_same_seed_gives_the_same_run_whatever_the_workers(trained, smoke_config, tmp_path):
+    metrics, run_dir = trained
+    cfg = smoke_config(tmp_path, "experiment=detector/proposed", "data.num_workers=2")
+    assert train(cfg) == metrics
+    ours, theirs = weights(run_dir), weights(Path(cfg.paths.run_dir))
+    assert all(torch.equal(ours[name], theirs[name]) for name in ours)
+
+
+class Stop(Callback):
+    """Breaks a run off in the middle of an epoch, as a crash would."""
+
+    def __init__(self, epoch):
+        self.epoch = epoch
+
+    def on_train_batch_end(self, trainer, pl_module, outputs, batch, batch_idx):
+        if trainer.current_epoch == self.epoch and batch_idx == 1:
+            raise RuntimeError("power cut")
+
+
+@pytest.mark.parametrize("epoch", [1, 3])
+def test_a_resumed_run_equals_an_uninterrupted_one(smoke_config, tmp_path, monkeypatch, epoch):
+    overrides = (
+        "experiment=detector/proposed",
+        "trainer.max_epochs=4",
+        "preset.scheduler.step_size=1",
+        "preset.scheduler.gamma=0.5",
+    )
+    whole = smoke_config(tmp_path / "whole", *overrides)
+    metrics = train(whole)
+
+    original = train_task.build_each
+    with monkeypatch.context() as patch:
+        patch.setattr(
+            train_task,
+            "build_each",
+            lambda node: [*original(node), *([Stop(epoch)] if "best" in node else [])],
+        )
+        broken = smoke_config(tmp_path / "broken", *overrides)
+        with pytest.raises(RuntimeError, match="power cut"):
+            train(broken)
+    run_dir = Path(broken.paths.run_dir)
+    assert json.loads((run_dir / "record.json").read_text())["status"] == "failed"
+
+    resumed = smoke_config(tmp_path / "broken", *overrides)
+    assert train(resumed) == metrics
+    ours, theirs = weights(Path(whole.paths.run_dir)), weights(run_dir)
+    assert all(torch.equal(ours[name], theirs[name]) for name in ours)
+    record = json.loads((run_dir / "record.json").read_text())
+    assert (record["status"], record["attempts"]) == ("complete", 2)
+
+
+@pytest.mark.parametrize("name", ["mean_offset", "ridge"])
+def test_a_yardstick_is_fitted_tested_and_kept(name, smoke_config, tmp_path):
+    cfg = smoke_config(tmp_path, f"experiment=detector/{name}")
+    metrics = train(cfg)
+    assert metrics["test/mpjpe"] < metrics["test/initial_mpjpe"] or name == "ridge"
+    state = torch.load(Path(cfg.paths.run_dir) / "checkpoints" / "best.ckpt", weights_only=True)["state_dict"]
+    assert state["net.bias"].any()
+    assert state["net.gram"][-1, -1] == 32
+
+
+@pytest.mark.parametrize(
+    ("override", "error", "message"),
+    [
+        ("body.path=missing.npz", FileNotFoundError, "missing.npz"),
+        ("data.source.path=missing.npz", FileNotFoundError, "missing.npz"),
+        ("data.margin_px=300", ValueError, "margin_px"),
+    ],
+)
+def test_bad_input_ends_a_run_before_it_starts(override, error, message, smoke_config, tmp_path):
+    with pytest.raises(error, match=message):
+        train(smoke_config(tmp_path, "experiment=detector/proposed", override))
+    assert not list((tmp_path / "runs").glob("*/record.json")) if (tmp_path / "runs").exists() else True
+
+
+def test_poses_with_nan_end_a_run_before_it_starts(smoke_config, tmp_path):
+    np.savez(tmp_path / "poses.npz", poses=np.full((3, 72), np.nan), clip=np.array(["a", "b", "c"]))
+    with pytest.raises(ValueError, match="NaN or infinite"):
+        train(smoke_config(tmp_path, f"data.source.path={tmp_path / 'poses.npz'}"))
+
+
+def test_a_nan_loss_stops_a_run_and_says_so(smoke_config, tmp_path):
+    cfg = smoke_config(
+        tmp_path, "experiment=detector/proposed", "module.optimizer.lr=1e30", "trainer.max_epochs=3"
+    )
+    with pytest.raises(FloatingPointError, match="lower the learning rate"):
+        train(cfg)
+    record = json.loads((Path(cfg.paths.run_dir) / "record.json").read_text())
+    assert record["status"] == "failed"
+
+
+def test_a_picture_that_cannot_be_drawn_warns_once_and_stops_nothing(smoke_config, tmp_path, monkeypatch):
+    import callbacks.pictures
+
+    def broken(*arguments):
+        raise OSError("no ink")
+
+    monkeypatch.setattr(callbacks.pictures, "draw_samples", broken)
+    with pytest.warns(UserWarning, match="no pictures: OSError: no ink") as caught:
+        train(smoke_config(tmp_path, "experiment=detector/basic"))
+    assert len([warning for warning in caught if "no ink" in str(warning.message)]) == 1
+
+
+def wait_for(condition, process, seconds=120):
+    end = time.monotonic() + seconds
+    while not condition():
+        assert process.poll() is None, "the run ended by itself"
+        assert time.monotonic() < end, "nothing happened"
+        time.sleep(0.05)
+
+
+def test_ctrl_c_leaves_a_valid_record_and_a_killed_run_resumes(tmp_path):
+    command = [
+        *(sys.executable, "run.py", "experiment=detector/basic", "preset=smoke", "logger=csv"),
+        *(
+            f"paths.output_dir={tmp_path}",
+            "callbacks.pictures=null",
+            "trainer.max_epochs=400",
+            "preset.num_val=1",
+        ),
+    ]
+    environment = os.environ | {"OMP_NUM_THREADS": "1"}
+
+    def start():
+        return subprocess.Popen(
+            command, cwd=ROOT, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT
+        )
+
+    def record():
+        [path] = tmp_path.glob("runs/*/record.json")
+        return json.loads(path.read_text())
+
+    def written():
+        return next((path.stat().st_mtime_ns for path in tmp_path.glob("runs/*/checkpoints/last.ckpt")), 0)
+
+    first = start()
+    wait_for(written, first)
+    first.send_signal(signal.SIGINT)
+    assert first.wait(60) != 0
+    assert record()["status"] == "interrupted"
+
+    before = written()
+    second = start()
+    wait_for(lambda: written() > before, second)
+    second.kill()
+    second.wait(60)
+    assert record()["status"] == "running"
+
+    [path] = tmp_path.glob("runs/*/checkpoints/last.ckpt")
+    epoch = torch.load(path, weights_only=True)["epoch"]
+    third = start()
+    before = written()
+    wait_for(lambda: written() > before, third)
+    third.kill()
+    output = third.communicate(timeout=60)[0].decode()
+    assert "resuming from" in output
+    assert f"epoch {epoch + 2}/400" in output
+    assert f"epoch {epoch}/400" not in output
