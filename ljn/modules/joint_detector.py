@@ -4,6 +4,7 @@ from collections.abc import Callable
 
 import torch
 from lightning.pytorch import LightningModule
+from lightning.pytorch.trainer.states import TrainerFn
 from lightning.pytorch.utilities.types import OptimizerLRScheduler
 from torch import Tensor
 from torch.optim import Optimizer
@@ -116,6 +117,7 @@ class YardstickDetector(JointDetector):
         """Add a batch to the yardstick's sums."""
         self.net.accumulate(batch["points"], batch["initial_joints"], batch["joints"])
 
-    def on_train_epoch_end(self) -> None:
-        """Fit the yardstick."""
-        self.net.solve()
+    def on_validation_start(self) -> None:
+        """Fit the yardstick to the epoch so far: in training, validation comes at the epoch's end."""
+        if self.trainer.state.fn == TrainerFn.FITTING:
+            self.net.solve()
