@@ -88,9 +88,9 @@ class SyntheticDepthDataModule(BodyDataModule):
             num_points=num_points,
             heading=heading,
             distance_m=(float(distance_m[0]), float(distance_m[1])),
-            margin_px=margin_px,
-            depth_noise_m=depth_noise_m,
-            keypoint_noise_px=keypoint_noise_px,
+            margin_px=float(margin_px),
+            depth_noise_m=float(depth_noise_m),
+            keypoint_noise_px=float(keypoint_noise_px),
             renderer=renderer,
             normals=normals,
         )

@@ -12,7 +12,7 @@ import platform
 import subprocess
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
@@ -49,8 +49,8 @@ def identity(cfg: DictConfig, body_hash: str) -> dict[str, Any]:
 
 
 def config_hash(plain: Mapping[str, Any]) -> str:
-    """First 8 hex digits of the SHA-256 of plain values, whatever the order of their keys."""
-    return hashlib.sha256(json.dumps(plain, sort_keys=True).encode()).hexdigest()[:8]
+    """First 8 hex digits of the SHA-256 of plain values, whatever the order of their keys; 10 and 10.0 agree."""
+    return hashlib.sha256(json.dumps(_canonical(plain), sort_keys=True).encode()).hexdigest()[:8]
 
 
 def run_directory(output_dir: Path, kind: str, name: str, preset: str, identity_hash: str) -> Path:
@@ -75,12 +75,20 @@ def read_json(path: Path) -> dict[str, Any] | None:
 
 
 def _finite(value: Any) -> Any:
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
+    return _map_floats(value, lambda number: number if math.isfinite(number) else None)
+
+
+def _canonical(value: Any) -> Any:
+    return _map_floats(value, lambda number: int(number) if number.is_integer() else number)
+
+
+def _map_floats(value: Any, function: Callable[[float], Any]) -> Any:
+    if isinstance(value, float):
+        return function(value)
     if isinstance(value, Mapping):
-        return {key: _finite(entry) for key, entry in value.items()}
+        return {key: _map_floats(entry, function) for key, entry in value.items()}
     if isinstance(value, list | tuple):
-        return [_finite(entry) for entry in value]
+        return [_map_floats(entry, function) for entry in value]
     return value
 
 

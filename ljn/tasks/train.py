@@ -2,6 +2,7 @@
 
 import logging
 import os
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,13 @@ from ljn.tasks.tracking import finish_tracking, link_run
 from ljn.tasks.validation import validate
 
 _LOG = logging.getLogger(__name__)
+# What Lightning says of things that are as they should be.
+_EXPECTED_WARNINGS = (
+    ".*LeafSpec.* is deprecated",  # its own use of PyTorch
+    ".*this fit will run with no optimizer",  # a yardstick
+    "Checkpoint directory .* exists and is not empty",  # a resumed run
+    "The number of training batches .* is smaller than the logging interval",
+)
 
 
 def train(cfg: DictConfig) -> dict[str, float]:
@@ -82,7 +90,10 @@ def train(cfg: DictConfig) -> dict[str, float]:
 
 
 def prepare_process(cfg: DictConfig) -> None:
-    """Seed the global generators, share the cores between PyTorch and the data workers."""
+    """Seed the global generators, share the cores between PyTorch and the data workers, quieten Lightning."""
+    logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
+    for message in _EXPECTED_WARNINGS:
+        warnings.filterwarnings("ignore", message)
     lightning.seed_everything(cfg.seed, workers=True, verbose=False)
     # With a thread on every core, each parallel region waits for the one that shares its core with a worker.
     torch.set_num_threads(cfg.num_threads or max(1, (os.cpu_count() or 1) // 2))

@@ -4,7 +4,6 @@ from pathlib import Path
 import pytest
 from hydra.errors import ConfigCompositionException
 from omegaconf import OmegaConf, open_dict
-from omegaconf.errors import OmegaConfBaseException
 
 from ljn.tasks.building import build, build_each, check_targets
 from ljn.tasks.validation import check_writable, validate

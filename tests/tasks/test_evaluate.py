@@ -102,7 +102,7 @@ def test_code_named_by_a_checkpoint_is_refused(trained, smoke_config, tmp_path):
             "command": f"touch {tmp_path / 'ran'}",
         }
 
-    with pytest.raises(ValueError, match="checkpoint's config.*os.system"):
+    with pytest.raises(ValueError, match=r"checkpoint's config.*os\.system"):
         evaluate(evaluation(smoke_config, trained, tmp_path, ckpt_path=edited(trained, tmp_path, edit)))
     assert not (tmp_path / "ran").exists()
 

@@ -92,6 +92,7 @@ def test_the_identity_ignores_paths_loggers_and_workers(compose_config):
         "group=sweep",
         "num_threads=3",
         "preset.name=other",
+        "data.keypoint_noise_px=10.0",
     ):
         assert hash_of(override) == same, override
     for override in (

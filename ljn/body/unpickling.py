@@ -1,0 +1,216 @@
+"""Arrays out of a pickle without running what it names.
+
+A pickle can run any code while it is read. Here none is: whatever the file names is either a plain container or a
+class of this module that only records what it was given; arrays are decoded from those records afterwards. So
+files with chumpy arrays and sparse matrices need neither chumpy nor scipy, and a forged one does no harm.
+"""
+
+import io
+import math
+import pickle
+import pickletools
+import re
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+class ForbiddenContentError(Exception):
+    """The file is well formed, but holds or names what it should not."""
+
+
+def read_pickled_arrays(data: bytes, keys: Sequence[str]) -> dict[str, NDArray[Any]]:
+    """The arrays of a pickled dict, those of `keys` that it holds.
+
+    Args:
+        data: The pickle. Arrays may be numpy's, chumpy's or scipy's sparse matrices, which become dense.
+        keys: Which entries to decode.
+
+    Raises:
+        ForbiddenContentError: It names something else than arrays and containers, or is not a dict of arrays.
+        Exception: Whatever numpy and pickle raise at a damaged file.
+    """
+    for opcode, argument, _ in pickletools.genops(data):
+        # The C unpickler of Python up to 3.13 allocates as many slots as the largest number says.
+        if opcode.name in ("PUT", "BINPUT", "LONG_BINPUT") and (argument or 0) > len(data):
+            raise ValueError("a memo number beyond the file's size")
+    content = _DataUnpickler(io.BytesIO(data), encoding="latin1").load()
+    if not isinstance(content, dict):
+        raise ForbiddenContentError(f"should hold a dict, got {type(content).__name__}.")
+    return {key: _decode(content[key], key, len(data)) for key in keys if key in content}
+
+
+class _Record:
+    """Stands for an object of a pickle: keeps what it was made from, and does nothing.
+
+    Having `__setstate__` is what keeps the unpickler from setting attributes on a record or its class.
+    """
+
+    args: tuple[Any, ...]
+    state: Any
+
+    def __new__(cls, *args: Any) -> "_Record":
+        record = super().__new__(cls)
+        record.args = args
+        record.state = None
+        return record
+
+    def __setstate__(self, state: Any) -> None:
+        self.state = state
+
+    def __getitem__(self, key: str) -> Any:
+        if not isinstance(self.state, dict) or key not in self.state:
+            raise ValueError(f"an object without its {key}")
+        return self.state[key]
+
+
+class _Array(_Record):
+    """`numpy.ndarray`, and the `_reconstruct` that makes one."""
+
+
+class _ArrayFromBuffer(_Record):
+    """`numpy`'s `_frombuffer`: an array of pickle protocol 5."""
+
+
+class _Dtype(_Record):
+    """`numpy.dtype`."""
+
+
+class _Bytes(_Record):
+    """Python 3's bytes in a pickle of protocol 2: `_codecs.encode(text, "latin1")`, `bytes()`."""
+
+
+class _Ch(_Record):
+    """`chumpy.Ch`: an array under "x"."""
+
+
+class _Select(_Record):
+    """`chumpy.reordering.Select`: entries "idxs" of the flattened array "a"."""
+
+
+class _Compressed(_Record):
+    """`scipy.sparse`'s csr form."""
+
+
+class _CompressedColumns(_Compressed):
+    """`scipy.sparse`'s csc form."""
+
+
+class _Coordinates(_Record):
+    """`scipy.sparse`'s coo form."""
+
+
+class _Reconstructor(_Record):
+    """`copyreg._reconstructor`: Python 2's way to make an instance of a class without calling it."""
+
+    def __new__(cls, kind: Any = None, *_: Any) -> Any:
+        if not (isinstance(kind, type) and issubclass(kind, _Record)):
+            raise TypeError("_reconstructor of something else than a recorded class")
+        return kind()
+
+
+_NAMES: dict[str, dict[str, type]] = {
+    "builtins": {
+        "object": _Record, "list": list, "dict": dict, "tuple": tuple, "set": set, "frozenset": frozenset,
+        "bytes": _Bytes, "bytearray": _Bytes,
+    },
+    "collections": {"OrderedDict": dict},
+    "copyreg": {"_reconstructor": _Reconstructor},
+    "_codecs": {"encode": _Bytes},
+    "numpy": {"ndarray": _Array, "dtype": _Dtype},
+    "numpy.core.multiarray": {"_reconstruct": _Array, "scalar": _Record},
+    "numpy.core.numeric": {"_frombuffer": _ArrayFromBuffer},
+    "chumpy.ch": {"Ch": _Ch},
+    "chumpy.reordering": {"Select": _Select},
+}  # fmt: skip
+"""All that a file may name, by module and name, with what stands for it."""
+
+_MODULE_ALIASES = {
+    "__builtin__": "builtins",
+    "copy_reg": "copyreg",
+    "numpy._core.multiarray": "numpy.core.multiarray",
+    "numpy._core.numeric": "numpy.core.numeric",
+}
+_SPARSE = {"csr": _Compressed, "csc": _CompressedColumns, "coo": _Coordinates}
+
+
+class _DataUnpickler(pickle.Unpickler):
+    """Reads a pickle into containers, text, numbers and records; nothing that it names is imported or run."""
+
+    def find_class(self, module: str, name: str) -> type:
+        """The stand-in for a global that the file names."""
+        known = _NAMES.get(_MODULE_ALIASES.get(module, module), {})
+        if name in known:
+            return known[name]
+        package = tuple(module.split("."))
+        if package[0] == "chumpy":
+            return _Record
+        if package[:2] == ("scipy", "sparse"):
+            return _SPARSE.get(name[:3], _Record)
+        raise ForbiddenContentError(
+            f"names {module}.{name}, which a SMPL model never needs: nothing of the file was run. "
+            "It may not be a SMPL model; get it from a source you trust."
+        )
+
+
+def _decode(value: Any, key: str, limit: int) -> NDArray[Any]:
+    """The array that a record describes; no larger than the file, which has `limit` bytes."""
+    if isinstance(value, _Array) and isinstance(value.state, tuple) and len(value.state) == 5:
+        _, shape, dtype, is_fortran, content = value.state
+        return _decode_buffer(content, dtype, shape, "F" if is_fortran else "C")
+    if isinstance(value, _ArrayFromBuffer):
+        content, dtype, shape, order = value.args[:4]
+        return _decode_buffer(content, dtype, shape, order)
+    if isinstance(value, _Ch):
+        return _decode(value["x"], key, limit)
+    if isinstance(value, _Select):
+        selected = _decode(value["a"], key, limit).ravel()[_decode(value["idxs"], key, limit).ravel()]
+        return selected.reshape(value["preferred_shape"])
+    if isinstance(value, _Compressed | _Coordinates):
+        return _decode_sparse(value, key, limit)
+    raise ForbiddenContentError(f"{key} should be an array, a chumpy array or a sparse matrix.")
+
+
+def _decode_buffer(content: Any, dtype: Any, shape: Any, order: Any) -> NDArray[Any]:
+    if not isinstance(dtype, _Dtype):
+        raise ValueError("an array without its dtype")
+    code = dtype.state[1] + dtype.args[0]
+    if not re.fullmatch(r"[<>=|][fiub][1248]", code):
+        raise ValueError("an array that holds no plain numbers")
+    # Any other shape is no array's: Python would multiply out strings and lists, too.
+    if not (isinstance(shape, tuple) and all(isinstance(size, int) for size in shape)):
+        raise ValueError("an array without its shape")
+    if isinstance(content, _Bytes):
+        content = content.args[0] if content.args else b""
+    if isinstance(content, str):
+        content = content.encode("latin1")
+    array = np.frombuffer(content, np.dtype(code))
+    if math.prod(shape) != array.size:
+        raise ValueError("an array of another size than its shape says")
+    return array.reshape(shape, order=order)
+
+
+def _decode_sparse(matrix: _Record, key: str, limit: int) -> NDArray[Any]:
+    num_rows, num_columns = matrix["_shape"]
+    # Checked before anything is allocated: a few bytes can claim any shape.
+    if min(num_rows, num_columns) < 0 or num_rows * num_columns > limit:
+        raise ValueError(f"{key} as a sparse matrix of shape {(num_rows, num_columns)}")
+    values = _decode(matrix["data"], key, limit)
+    if isinstance(matrix, _Coordinates):
+        coordinates = matrix.state.get("coords") or (matrix["row"], matrix["col"])
+        rows, columns = (_decode(indices, key, limit) for indices in coordinates)
+    else:
+        columns = _decode(matrix["indices"], key, limit)
+        ends = _decode(matrix["indptr"], key, limit)
+        if ends[-1] != len(values):
+            raise ValueError(f"{key} as a sparse matrix that ends elsewhere than its values")
+        rows = np.searchsorted(ends[1:], np.arange(len(values)), side="right")
+        if isinstance(matrix, _CompressedColumns):
+            rows, columns = columns, rows
+    if min(rows.min(initial=0), columns.min(initial=0)) < 0:
+        raise ValueError(f"{key} as a sparse matrix with negative indices")
+    dense = np.zeros((num_rows, num_columns))
+    np.add.at(dense, (rows, columns), values)
+    return dense
