@@ -193,12 +193,18 @@ class SyntheticDepthDataModule(BodyDataModule):
 
         return cached_samples(self.cache_dir, self.fixed_key(split), make)
 
+    @property
+    def _uses_gl(self) -> bool:
+        return self.settings.renderer == "pyrender"
+
     def _loader(self, samples: Dataset, batches: Any, persistent: bool = True) -> DataLoader:
         return DataLoader(
             samples,
             batch_sampler=batches,
             collate_fn=_as_is,
             num_workers=self.num_workers,
+            # A GL context does not survive a fork.
+            multiprocessing_context="spawn" if self._uses_gl and self.num_workers > 0 else None,
             persistent_workers=persistent and self.num_workers > 0,
             prefetch_factor=self.prefetch_batches if self.num_workers > 0 else None,
             worker_init_fn=_one_thread,

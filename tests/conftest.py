@@ -10,7 +10,8 @@ from datamodules.synthetic import SyntheticDepthDataModule
 from ljn.body import SMPL, load_body_model
 from ljn.geometry.camera import Camera
 from ljn.geometry.rotations import CAMERA_FROM_BODY, rotation_about, rotmat_to_rotvec, rotvec_to_rotmat
-from ljn.optional import import_open3d
+from ljn.optional import import_open3d, import_pyrender
+from ljn.render import get_renderer
 
 
 @pytest.fixture(scope="session")
@@ -78,3 +79,18 @@ def open3d():
         return import_open3d()
     except ImportError as error:
         pytest.skip(str(error))
+
+
+@pytest.fixture(scope="session")
+def pyrender():
+    """The `pyrender` module; without it, or without EGL, the test is skipped, saying what is missing."""
+    try:
+        module = import_pyrender()
+        get_renderer("pyrender")(
+            torch.tensor([[[0.0, 0, 1], [1, 0, 1], [0, 1, 1]]]),
+            torch.tensor([[0, 1, 2]]),
+            Camera(fx=10, fy=10, cx=4, cy=4, width=8, height=8),
+        )
+    except ImportError as error:
+        pytest.skip(str(error))
+    return module

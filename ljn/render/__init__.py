@@ -1,7 +1,7 @@
 """Depth renderers behind one interface; each backend is imported when it is first asked for.
 
-`zbuffer` (numba) is the default on a CPU and needs neither GL nor a display. `open3d` casts rays and is an
-independent reference.
+`zbuffer` (numba) is the default on a CPU and needs neither GL nor a display. `pyrender` is the thesis's way, through
+EGL. `open3d` casts rays and is an independent reference.
 """
 
 from importlib import import_module
@@ -32,7 +32,11 @@ class Renderer(Protocol):
         ...
 
 
-_BACKENDS = {"zbuffer": "ljn.render.zbuffer:ZBuffer", "open3d": "ljn.render.raycast:RayCaster"}
+_BACKENDS = {
+    "zbuffer": "ljn.render.zbuffer:ZBuffer",
+    "pyrender": "ljn.render.opengl:PyRender",
+    "open3d": "ljn.render.raycast:RayCaster",
+}
 RENDERERS = ("auto", *_BACKENDS)
 
 

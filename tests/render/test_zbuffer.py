@@ -245,7 +245,9 @@ def test_vertices_without_a_batch_dimension_are_an_error():
 
 
 def test_an_unknown_renderer_is_an_error_that_names_the_known_ones():
-    with pytest.raises(ValueError, match="renderer: expected one of auto, zbuffer, open3d, got 'opengl'"):
+    with pytest.raises(
+        ValueError, match="renderer: expected one of auto, zbuffer, pyrender, open3d, got 'opengl'"
+    ):
         get_renderer("opengl")
     assert RENDERERS[0] == "auto"
 
