@@ -6,6 +6,7 @@ from typing import Any
 
 from lightning.pytorch import LightningModule, Trainer
 from lightning.pytorch.callbacks import TQDMProgressBar
+from torch import Tensor
 
 
 class Progress(TQDMProgressBar):
@@ -24,6 +25,7 @@ class Progress(TQDMProgressBar):
         self._samples = 0
         self._started = 0.0
         self._training_s = 0.0
+        self._loss: Tensor | None = None
 
     def on_train_epoch_start(self, trainer: Trainer, *args: Any) -> None:
         """Start the clock."""
@@ -36,12 +38,15 @@ class Progress(TQDMProgressBar):
         """Count the samples."""
         self._samples += len(next(iter(batch.values()))) * trainer.world_size
         self._training_s = time.monotonic() - self._started
+        self._loss = outputs.get("loss") if isinstance(outputs, dict) else None
         super().on_train_batch_end(trainer, pl_module, outputs, batch, batch_idx)
 
     def get_metrics(self, trainer: Trainer, pl_module: LightningModule) -> dict[str, Any]:
         """What the bar shows beside its own counts."""
         shown = super().get_metrics(trainer, pl_module)
         shown.pop("v_num", None)
+        if self._loss is not None:
+            shown["loss"] = f"{float(self._loss):.4f}"
         if self.metric in trainer.callback_metrics:
             shown[self.metric] = f"{float(trainer.callback_metrics[self.metric]):.1f} {self.unit}"
         if self._training_s:
