@@ -23,7 +23,7 @@ def main(cfg: DictConfig) -> float | None:
     """Run the task that `cfg.task` names; returns the metric that `cfg.optimized_metric` names."""
     try:
         metrics = hydra.utils.get_method(cfg.task._target_)(cfg)
-    except (ValueError, FileNotFoundError, ImportError) as error:
+    except (ValueError, FileNotFoundError, ImportError, FloatingPointError) as error:
         # A user's mistake: the message names the fix. A sweep needs the exception, a developer the traceback.
         if HydraConfig.get().mode == RunMode.MULTIRUN or os.environ.get("HYDRA_FULL_ERROR") == "1":
             raise

@@ -1,6 +1,8 @@
 """Pictures of predicted joints: of fixed validation samples while training, of the extremes after a test."""
 
 import warnings
+from collections.abc import Callable
+from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -8,6 +10,7 @@ import numpy as np
 import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.loggers import WandbLogger
+from lightning.pytorch.trainer.states import TrainerFn
 from torch import Tensor
 
 from ljn.body.skeleton import BONES
@@ -37,6 +40,21 @@ class Sample(NamedTuple):
     title: str
 
 
+def _never_stops(hook: Callable[..., None]) -> Callable[..., None]:
+    """A hook of `JointPictures` whose errors, whatever they are, become one warning: the run goes on."""
+
+    @wraps(hook)
+    def guarded(self: "JointPictures", *arguments: Any, **keywords: Any) -> None:
+        try:
+            hook(self, *arguments, **keywords)
+        except Exception as error:
+            if not self.has_warned:
+                warnings.warn(f"no pictures: {type(error).__name__}: {error}", stacklevel=2)
+            self.has_warned = True
+
+    return guarded
+
+
 class JointPictures(Callback):
     """Draws clouds with true (blue) and predicted (red) skeletons, from the front and from the side.
 
@@ -53,10 +71,11 @@ class JointPictures(Callback):
         self.directory = Path(directory)
         self.num_samples = num_samples
         self.every_n_epochs = every_n_epochs
-        self._has_warned = False
+        self.has_warned = False
         self._validation: list[Sample] = []
         self._test_joints: list[tuple[Tensor, Tensor]] = []
 
+    @_never_stops
     def on_validation_batch_end(
         self,
         trainer: Trainer,
@@ -67,7 +86,7 @@ class JointPictures(Callback):
         dataloader_idx: int = 0,
     ) -> None:
         """Keep the first samples."""
-        if not self._is_due(trainer):
+        if trainer.state.fn != TrainerFn.FITTING or not self._is_due(trainer):
             return
         for row in range(min(self.num_samples - len(self._validation), len(batch["joints"]))):
             error = float(mpjpe(outputs["pred_joints"][row], batch["joints"][row]))
@@ -80,12 +99,14 @@ class JointPictures(Callback):
                 )
             )
 
+    @_never_stops
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Draw them."""
         samples, self._validation = self._validation, []
         if samples:
             self._save(trainer, samples, "val/samples", f"val_epoch_{trainer.current_epoch + 1:03d}")
 
+    @_never_stops
     def on_test_batch_end(
         self,
         trainer: Trainer,
@@ -98,9 +119,12 @@ class JointPictures(Callback):
         """Keep the joints of every sample."""
         self._test_joints.append((outputs["pred_joints"].detach().cpu(), batch["joints"].cpu()))
 
+    @_never_stops
     def on_test_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Draw the best, the median and the worst samples on a page."""
         kept, self._test_joints = self._test_joints, []
+        if not kept:
+            return
         pred_joints = torch.cat([pred for pred, _ in kept])
         errors = mpjpe(pred_joints, torch.cat([joints for _, joints in kept]))
         order = errors.nan_to_num(nan=torch.inf).argsort().tolist()
@@ -133,20 +157,13 @@ class JointPictures(Callback):
         return epoch % self.every_n_epochs == 0 or epoch in (1, trainer.max_epochs)
 
     def _save(self, trainer: Trainer, samples: list[Sample], key: str, name: str) -> None:
-        if not trainer.is_global_zero:
-            return
-        try:
-            figure = draw_samples(samples, self.num_samples)
-            self.directory.mkdir(parents=True, exist_ok=True)
-            path = self.directory / f"{name}.png"
-            figure.savefig(path)
-            for logger in trainer.loggers:
-                if isinstance(logger, WandbLogger):
-                    logger.log_image(key, [str(path)])
-        except Exception as error:  # whatever goes wrong in drawing, training goes on
-            if not self._has_warned:
-                warnings.warn(f"no pictures: {type(error).__name__}: {error}", stacklevel=2)
-            self._has_warned = True
+        figure = draw_samples(samples, self.num_samples)
+        self.directory.mkdir(parents=True, exist_ok=True)
+        path = self.directory / f"{name}.png"
+        figure.savefig(path)
+        for logger in trainer.loggers:
+            if isinstance(logger, WandbLogger):
+                logger.log_image(key, [str(path)])
 
 
 def _sample(batch: Batch, pred_joints: Tensor, row: int, title: str) -> Sample:

@@ -46,6 +46,8 @@ class SampleErrors(Callback):
 
     def on_test_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Write the file."""
+        if not self._batches:
+            return
         arrays = {name: torch.cat([batch[name] for batch in self._batches]) for name in self._batches[0]}
         self._batches = []
         arrays["errors_mm"] = joint_errors_mm(arrays["pred_joints"], arrays["joints"]).float()

@@ -1,6 +1,5 @@
 """A sweep's results side by side: on the terminal, as JSON and as a picture."""
 
-import logging
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -13,15 +12,15 @@ from ljn.tasks.records import read_json, write_json
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_LOG = logging.getLogger(__name__)
 _INITIAL = "initial"
 
 
 class SweepSummary(Callback):
-    """Hydra callback: gathers the metrics of a sweep's runs.
+    """Hydra callback: gathers the metrics of a sweep's runs, after every job, so that a failure costs no result.
 
-    Each job leaves a note in Hydra's sweep directory, since jobs may run in processes of their own; at the end
-    the notes become `summary.json` (`NAME_mpjpe` for each row, mm) and `report.png`.
+    Each job leaves a note in Hydra's sweep directory, since jobs may run in processes of their own; the notes
+    become `summary.json` (`NAME_mpjpe` for each row, mm; null for a job that failed), `report.png` and a table on
+    the terminal.
 
     Args:
         directory: Where the summary goes.
@@ -30,46 +29,54 @@ class SweepSummary(Callback):
     def __init__(self, directory: str | Path) -> None:
         self.directory = Path(directory)
 
+    def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
+        """Remove an earlier sweep's summary."""
+        for name in ("summary.json", "report.png"):
+            (self.directory / name).unlink(missing_ok=True)
+
     def on_job_end(self, config: DictConfig, job_return: JobReturn, **kwargs: Any) -> None:
-        """Note where the job's run is."""
+        """Note where the job's run is; sum up what there is."""
         assert job_return.cfg is not None
-        run_dir = job_return.cfg.paths.run_dir
-        note = {
-            "name": str(job_return.cfg.name),
-            "run_dir": run_dir,
-            "is_complete": job_return.status == JobStatus.COMPLETED,
-        }
         notes = Path(config.hydra.sweep.dir) / "jobs"
         notes.mkdir(parents=True, exist_ok=True)
-        write_json(notes / f"{int(config.hydra.job.num):04d}.json", note)
-
-    def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
-        """Print the table, write the files."""
-        notes = [
-            read_json(path) or {} for path in sorted((Path(config.hydra.sweep.dir) / "jobs").glob("*.json"))
-        ]
-        complete = [note for note in notes if note.get("is_complete")]
-        runs = {
-            note["name"].rpartition("/")[2]: (Path(note["run_dir"]), metrics)
-            for note in complete
-            if (metrics := read_json(Path(note["run_dir"]) / "metrics.json"))
+        note = {
+            "name": str(job_return.cfg.name).rpartition("/")[2],
+            "run_dir": job_return.cfg.paths.run_dir,
+            "is_complete": job_return.status == JobStatus.COMPLETED,
         }
-        if not runs:
-            return
-        rows = {name: metrics["test/mpjpe"] for name, (_, metrics) in runs.items()}
-        rows = {_INITIAL: next(iter(runs.values()))[1]["test/initial_mpjpe"], **rows}
-        best = min(runs, key=rows.__getitem__)
-        pictures = runs[best][0] / "pictures"
+        write_json(notes / f"{int(config.hydra.job.num):04d}.json", note)
+        self._sum_up([read_json(path) or {} for path in sorted(notes.glob("*.json"))])
+
+    def _sum_up(self, notes: list[dict[str, Any]]) -> None:
+        rows: dict[str, dict[str, float] | None] = {}
+        directories: dict[str, Path] = {}
+        for note in notes:
+            number = sum(name.partition("#")[0] == note["name"] for name in rows)
+            name = note["name"] if number == 0 else f"{note['name']}#{number + 1}"
+            directories[name] = Path(note["run_dir"] or ".")
+            rows[name] = read_json(directories[name] / "metrics.json") if note["is_complete"] else None
+        done = {name: metrics for name, metrics in rows.items() if metrics is not None}
+        values: dict[str, float | None] = {}
+        if done:
+            values[_INITIAL] = next(iter(done.values()))["test/initial_mpjpe"]
+        values |= {name: metrics["test/mpjpe"] if metrics else None for name, metrics in rows.items()}
         self.directory.mkdir(parents=True, exist_ok=True)
-        write_json(self.directory / "summary.json", {f"{name}_mpjpe": value for name, value in rows.items()})
-        report = self.directory / "report.png"
-        draw_report(rows, best, pictures / "test_best_median_worst.png").savefig(report)
+        write_json(
+            self.directory / "summary.json", {f"{name}_mpjpe": value for name, value in values.items()}
+        )
 
         print(f"\n{'test MPJPE, mm':16s}")
-        for name, value in rows.items():
-            pckh = "" if name == _INITIAL else f"   PCKh {runs[name][1]['test/pckh']:5.1f} %"
-            print(f"  {name:14s}{value:8.1f}{pckh}")
-        print(f"\nreport    {report}\nsummary   {self.directory / 'summary.json'}\npictures  {pictures}")
+        for name, value in values.items():
+            pckh = f"   PCKh {done[name]['test/pckh']:5.1f} %" if name in done else ""
+            print(f"  {name:14s}" + (f"{value:8.1f}{pckh}" if value is not None else "  failed"))
+        if done:
+            best = min(done, key=lambda name: done[name]["test/mpjpe"])
+            pictures = directories[best] / "pictures"
+            report = self.directory / "report.png"
+            known = {name: value for name, value in values.items() if value is not None}
+            draw_report(known, best, pictures / "test_best_median_worst.png").savefig(report)
+            print(f"\nreport    {report}\nsummary   {self.directory / 'summary.json'}\npictures  {pictures}")
+        print(flush=True)
 
 
 def draw_report(rows: dict[str, float], best: str, page: Path) -> "Figure":

@@ -34,11 +34,10 @@ def cached_samples(directory: Path, key: str, make: Callable[[], Mapping[str, Te
         except (OSError, ValueError, KeyError, EOFError) as error:
             warnings.warn(f"samples in {place} are damaged ({error}); making them anew", stacklevel=2)
             shutil.rmtree(place, ignore_errors=True)
-    samples = make()
-    directory.mkdir(parents=True, exist_ok=True)
     draft = directory / f"{key}.{os.getpid()}.{uuid.uuid4().hex[:8]}.tmp"
-    draft.mkdir()
+    draft.mkdir(parents=True)  # before the samples are made: it may not be possible
     try:
+        samples = make()
         shapes = {}
         for name, value in samples.items():
             np.save(draft / f"{name}.npy", value.numpy(), allow_pickle=False)
@@ -56,6 +55,8 @@ def cached_samples(directory: Path, key: str, make: Callable[[], Mapping[str, Te
 
 def _read(place: Path) -> dict[str, Tensor]:
     shapes = json.loads((place / "index.json").read_text())
+    if not isinstance(shapes, dict) or not shapes:
+        raise ValueError("index.json names no arrays")
     samples = {}
     for name, shape in shapes.items():
         # Copy on write: torch wants writable memory, and nobody else may see a change.

@@ -1,5 +1,6 @@
 """From a pose record to a training sample: mesh, depth image, noisy cloud with normals, initial joints."""
 
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -11,7 +12,7 @@ from torch import Tensor
 
 from datamodules.placement import HEADINGS, check_margin, draw_heading, place
 from datamodules.sources import PoseRecords
-from ljn.body import SMPL, BodyModel
+from ljn.body import GENDERS, SMPL, BodyModel
 from ljn.cloud.keypoints import lift_keypoints
 from ljn.cloud.normals import NormalEstimator, get_normal_estimator
 from ljn.cloud.sampling import add_depth_noise, sample_cloud
@@ -61,8 +62,9 @@ class SynthesisSettings:
         if not 0 < self.distance_m[0] <= self.distance_m[1]:
             raise ValueError(f"distance_m: expected 0 < nearest <= farthest, got {self.distance_m}")
         for name in ("margin_px", "depth_noise_m", "keypoint_noise_px"):
-            if getattr(self, name) < 0:
-                raise ValueError(f"{name}: expected 0 or more, got {getattr(self, name)}")
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value >= 0):
+                raise ValueError(f"{name}: expected a number of 0 or more, got {value}")
 
 
 class DepthSynthesizer:
@@ -163,7 +165,7 @@ class DepthSynthesizer:
             joints=joints.float(),
             pose=pose.float(),
             betas=betas.float(),
-            gender=torch.from_numpy(self.records.gender[rows]),
+            gender=torch.full((len(keys),), GENDERS[self.body.gender]),
             camera=intrinsics.float(),
             sample_id=torch.tensor(rows),
         )

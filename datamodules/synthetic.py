@@ -45,7 +45,8 @@ class SyntheticDepthDataModule(BodyDataModule):
         eval_seed: Seed of the validation and test samples' draws.
         cache_dir: Where the fixed sets are kept.
         body_path: SMPL-format file; the embedded body by default.
-        body_gender: Which embedded body.
+        body_gender: Which embedded body, or which gender the file holds.
+        redraw_each_epoch: Whether headings, places, noise and points are drawn anew in every epoch.
         num_workers: Worker processes; 0 renders in the main process.
         prefetch_batches: Batches that each worker keeps ready.
         heading: See `datamodules.placement.draw_heading`.
@@ -72,6 +73,7 @@ class SyntheticDepthDataModule(BodyDataModule):
         cache_dir: str | Path,
         body_path: str | Path | None = None,
         body_gender: str = "neutral",
+        redraw_each_epoch: bool = True,
         num_workers: int = 1,
         prefetch_batches: int = 4,
         heading: str = "histogram",
@@ -87,7 +89,7 @@ class SyntheticDepthDataModule(BodyDataModule):
             camera=camera,
             num_points=num_points,
             heading=heading,
-            distance_m=(float(distance_m[0]), float(distance_m[1])),
+            distance_m=_pair("distance_m", distance_m),
             margin_px=float(margin_px),
             depth_noise_m=float(depth_noise_m),
             keypoint_noise_px=float(keypoint_noise_px),
@@ -106,6 +108,7 @@ class SyntheticDepthDataModule(BodyDataModule):
         self.cache_dir = Path(cache_dir)
         self.body_path = body_path
         self.body_gender = body_gender
+        self.redraw_each_epoch = redraw_each_epoch
         self.num_workers = num_workers
         self.prefetch_batches = prefetch_batches
         self._body: BodyModel | None = None
@@ -120,6 +123,12 @@ class SyntheticDepthDataModule(BodyDataModule):
         return self._body
 
     @property
+    def fingerprint(self) -> str:
+        """See `BodyDataModule`."""
+        made_of = f"{_SAMPLES_VERSION} {self.body.hash} {self.source.name} {self.source.fingerprint}"
+        return hashlib.sha256(made_of.encode()).hexdigest()[:16]
+
+    @property
     def licence(self) -> str:
         """The source's licence; see `BodyDataModule`."""
         return self.source.licence
@@ -128,7 +137,7 @@ class SyntheticDepthDataModule(BodyDataModule):
         """See `BodyDataModule`."""
         return {
             "source": self.source.name,
-            "fingerprint": self.source.fingerprint,
+            "fingerprint": self.fingerprint,
             "licence": self.source.licence,
             "sizes": self.sizes,
             "body": {"hash": self.body.hash, "gender": self.body.gender},
@@ -158,7 +167,7 @@ class SyntheticDepthDataModule(BodyDataModule):
         """Samples rendered as they are needed; the last, incomplete batch is dropped."""
         if self._train is None:
             raise RuntimeError("setup('fit') has not been called")
-        sampler: Any = EpochSampler(self.sizes["train"], self.seed)
+        sampler: Any = EpochSampler(self.sizes["train"], self.seed, self.redraw_each_epoch)
         batches = BatchSampler(sampler, self.batch_size, drop_last=len(sampler) >= self.batch_size)
         return self._loader(SynthesizedSamples(self._train), batches)
 
@@ -172,10 +181,7 @@ class SyntheticDepthDataModule(BodyDataModule):
 
     def fixed_key(self, split: str) -> str:
         """Hash of everything that a fixed set depends on."""
-        made_of = (
-            f"{_SAMPLES_VERSION} {split} {self.sizes[split]} {self.pool_seed} {self.eval_seed} {self.settings} "
-            f"{self.body.hash} {self.source.name} {self.source.fingerprint}"
-        )
+        made_of = f"{self.fingerprint} {split} {self.sizes[split]} {self.pool_seed} {self.eval_seed} {self.settings}"
         return f"{split}-{hashlib.sha256(made_of.encode()).hexdigest()[:16]}"
 
     def _fixed_samples(self, split: str) -> dict[str, Tensor]:
@@ -221,7 +227,13 @@ class SynthesizedSamples(Dataset):
         return len(self.synthesizer.records)
 
     def __getitems__(self, keys: list[tuple[int, int]]) -> Batch:
-        return self.synthesizer.batch(keys)
+        # In the main process, too: another number of threads can round the body's products differently.
+        num_threads = torch.get_num_threads()
+        torch.set_num_threads(1)
+        try:
+            return self.synthesizer.batch(keys)
+        finally:
+            torch.set_num_threads(num_threads)
 
 
 class FixedSamples(Dataset):
@@ -243,9 +255,10 @@ class EpochSampler(Sampler[tuple[int, int]]):
     The number travels with the index, so that workers that live on through epochs draw anew without being told.
     """
 
-    def __init__(self, num_samples: int, seed: int) -> None:
+    def __init__(self, num_samples: int, seed: int, redraws: bool = True) -> None:
         self.num_samples = num_samples
         self.seed = seed
+        self.redraws = redraws
         self.epoch = 0
 
     def set_epoch(self, epoch: int) -> None:
@@ -257,9 +270,15 @@ class EpochSampler(Sampler[tuple[int, int]]):
 
     def __iter__(self) -> Iterator[tuple[int, int]]:
         generator = torch.Generator().manual_seed(self.seed * 1_000_003 + self.epoch)
-        epoch = self.epoch
+        epoch = self.epoch if self.redraws else 0
         for index in torch.randperm(self.num_samples, generator=generator).tolist():
             yield epoch, index
+
+
+def _pair(name: str, values: Sequence[float]) -> tuple[float, float]:
+    if not isinstance(values, Sequence) or len(values) != 2:
+        raise ValueError(f"{name}: expected two numbers, nearest and farthest, got {values!r}")
+    return float(values[0]), float(values[1])
 
 
 def _as_is(batch: Any) -> Any:

@@ -47,6 +47,11 @@ class BodyDataModule(LightningDataModule):
 
     @property
     @abstractmethod
+    def fingerprint(self) -> str:
+        """Hash of what the data's files and its code make of its settings: the body, the poses, their version."""
+
+    @property
+    @abstractmethod
     def licence(self) -> str:
         """Where the data comes from and what may be done with it: goes into checkpoints."""
 

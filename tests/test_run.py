@@ -66,7 +66,30 @@ def test_the_demo_sweep_runs_every_row_and_sums_up(tmp_path):
         assert f"\n  {row} " in done.stdout
     runs = list((tmp_path / "runs").iterdir())
     assert len(runs) == 4
+    assert "failed" not in done.stdout
     for run in runs:
         assert json.loads((run / "record.json").read_text())["status"] == "complete"
         # A W&B run of its own for each job, offline.
         assert len(list(run.glob("wandb/offline-run-*/run-*.wandb"))) == 1
+
+
+def test_a_failing_job_costs_the_others_nothing_and_is_printed_as_failed(tmp_path):
+    done = python(
+        *(
+            "run.py",
+            "sweep=demo",
+            "preset=smoke",
+            f"paths.output_dir={tmp_path}",
+            "data.num_workers=0",
+            "logger=csv",
+        ),
+        *("preset.num_train=32", "preset.num_val=8", "preset.num_test=16", "preset.max_epochs=1"),
+        *("experiment=detector/mean_offset,detector/proposed,detector/basic", "preset.group_size=0"),
+        env=os.environ | {"OMP_NUM_THREADS": "1"},
+    )
+    assert done.returncode == 1
+    summary = json.loads((tmp_path / "demo" / "summary.json").read_text())
+    assert summary["proposed_mpjpe"] is None
+    assert summary["mean_offset_mpjpe"] > 0
+    assert summary["basic_mpjpe"] > 0
+    assert "proposed        failed" in done.stdout

@@ -52,6 +52,9 @@ class EmbeddedSource:
         self.jitter_deg = jitter_deg
         self.max_beta = max_beta
         self.path = Path(path or _DATA / "seed_poses.npz")
+        if path is not None:
+            self.name = f"clips of {self.path.name}"
+            self.licence = f"the user's own file {self.path.name}; its licence is not known here"
         self.split_path = Path(split_path or _DATA / "embedded_split.json")
 
     def check(self) -> None:

@@ -42,8 +42,7 @@ def squared_distances(centres: Tensor, points: Tensor) -> Tensor:
     Summed over the three differences rather than expanded into a product: exact for close points far from
     the origin, where the expansion cancels.
     """
-    total = centres[..., :, None, 0] - points[..., None, :, 0]
-    total = total.square_() if not total.requires_grad else total.square()
+    total = (centres[..., :, None, 0] - points[..., None, :, 0]).square()
     for axis in (1, 2):
         difference = centres[..., :, None, axis] - points[..., None, :, axis]
         total = total + difference * difference

@@ -22,14 +22,14 @@ class JointDetector(LightningModule):
 
     Args:
         net: The network: `(points, initial_joints) -> joints`.
-        optimizer: Makes the optimizer from the parameters.
+        optimizer: Makes the optimizer from the parameters; None for a module that is not trained here.
         scheduler: Makes the learning-rate scheduler, stepped once an epoch, from the optimizer; None for none.
     """
 
     def __init__(
         self,
         net: Detector,
-        optimizer: Callable[..., Optimizer],
+        optimizer: Callable[..., Optimizer] | None = None,
         scheduler: Callable[[Optimizer], LRScheduler] | None = None,
     ) -> None:
         super().__init__()
@@ -45,6 +45,8 @@ class JointDetector(LightningModule):
 
     def configure_optimizers(self) -> OptimizerLRScheduler:
         """The optimizer and, stepped once an epoch, the scheduler."""
+        if self._make_optimizer is None:
+            return None
         optimizer = self._make_optimizer(self.parameters())
         if self._make_scheduler is None:
             return optimizer
@@ -59,9 +61,7 @@ class JointDetector(LightningModule):
                 "learning rate, or check the data (samples "
                 f"{batch['sample_id'].tolist()})"
             )
-        self.log(
-            "train/loss", loss, prog_bar=True, on_step=False, on_epoch=True, batch_size=len(batch["joints"])
-        )
+        self.log("train/loss", loss, on_step=False, on_epoch=True, batch_size=len(batch["joints"]))
         return loss
 
     def validation_step(self, batch: Batch, batch_idx: int) -> dict[str, Tensor]:
@@ -106,12 +106,8 @@ class YardstickDetector(JointDetector):
     net: Yardstick
 
     def __init__(self, net: Yardstick) -> None:
-        super().__init__(net, optimizer=torch.optim.SGD)
+        super().__init__(net)
         self.automatic_optimization = False
-
-    def configure_optimizers(self) -> OptimizerLRScheduler:
-        """No optimizer: there is nothing to descend."""
-        return None
 
     def training_step(self, batch: Batch, batch_idx: int) -> None:  # type: ignore[override]
         """Add a batch to the yardstick's sums."""
@@ -121,3 +117,7 @@ class YardstickDetector(JointDetector):
         """Fit the yardstick to the epoch so far: in training, validation comes at the epoch's end."""
         if self.trainer.state.fn == TrainerFn.FITTING:
             self.net.solve()
+
+    def on_train_epoch_end(self) -> None:
+        """Fit the yardstick, also where there is no validation."""
+        self.net.solve()

@@ -19,12 +19,11 @@ class LocalJointNetwork(Detector):
     relative to that joint, its local feature, the cloud's global feature and row i of the initial joints'
     distance matrix. Sub-network i, a PointNet classifier, gives the output of joint i.
 
-    Relative positions are in units of the ball's radius: in metres they are small beside the other inputs, and
-    learning is much slower.
-
     Args:
         radii_m: Ball radius of each of the 24 joints, metres.
         group_size: Points in a group (l' of the thesis).
+        relative_to_radius: Whether relative positions are in units of the ball's radius, or in metres: small
+            beside the other inputs, and learning is then much slower.
         edm: Whether points carry the row of the distance matrix (off: the ablation "w/o EDM").
         in_channels: Channels of a point.
         local_channels: Trunk widths up to the local feature.
@@ -41,6 +40,7 @@ class LocalJointNetwork(Detector):
         self,
         radii_m: Sequence[float],
         group_size: int = 128,
+        relative_to_radius: bool = True,
         edm: bool = True,
         in_channels: int = 6,
         local_channels: Sequence[int] = (64, 64),
@@ -60,6 +60,7 @@ class LocalJointNetwork(Detector):
         self.register_buffer("radii", torch.tensor(radii_m, dtype=torch.float32), persistent=False)
         self.radii: Tensor
         self.group_size = group_size
+        self.relative_to_radius = relative_to_radius
         self.edm = edm
         self.trunk = PointNet(in_channels, local_channels, global_channels)
         self.num_local = 3 + local_channels[-1]
@@ -79,7 +80,9 @@ class LocalJointNetwork(Detector):
         index = ball_group(points[..., :3], initial_joints, self.radii, self.group_size)  # (B, K, n)
         grouped = gather_points(torch.cat([points[..., :3], local], -1), index)  # (B, K, n, 3 + C)
         position, feature = grouped.split([3, local.shape[-1]], -1)
-        relative = (position - initial_joints[:, :, None]) / self.radii[:, None, None]
+        relative = position - initial_joints[:, :, None]
+        if self.relative_to_radius:
+            relative = relative / self.radii[:, None, None]
         grouped = torch.cat([relative, feature], -1).transpose(0, 1)  # (K, B, n, 3 + C)
 
         hidden = self._first_layer(grouped, pooled, initial_joints)  # (K, B * n, C')

@@ -61,7 +61,7 @@ class Ridge(Yardstick):
         penalty: Weight of the squared coefficients, relative to one training sample, m^2.
     """
 
-    def __init__(self, penalty: float = 1e-3) -> None:
+    def __init__(self, penalty: float = 1e-5) -> None:
         super().__init__()
         self.penalty = penalty
 

@@ -66,7 +66,7 @@ def build(config: DictConfig, **arguments: Any) -> Any:
         # The cause says what is wrong; Hydra's wrapper would hide its type from callers and users.
         if isinstance(error.__cause__, ValueError | FileNotFoundError | ImportError):
             raise error.__cause__ from None
-        raise
+        raise ValueError(str(error)) from error
 
 
 def build_each(configs: DictConfig | None) -> list[Any]:

@@ -1,17 +1,73 @@
-"""Reading checkpoints: data, never code, with a clear error for what is not one of ours."""
+"""Checkpoints: written whole or not at all, with where they came from; read as data, never as code."""
 
 import hashlib
+import os
 import pickle
 import zipfile
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import torch
+from lightning.pytorch import Callback, LightningModule, Trainer
+from lightning.pytorch.plugins.io import TorchCheckpointIO
 from torch import Tensor
 
 CHECKPOINT_VERSION = 1
-PROVENANCE_KEY = "ljn"
+_PROVENANCE_KEY = "ljn"
+# What a damaged file makes PyTorch, pickle and zipfile raise.
+_READ_ERRORS = (
+    AttributeError, EOFError, LookupError, OSError, RuntimeError, TypeError, ValueError, pickle.UnpicklingError,
+    zipfile.BadZipFile,
+)  # fmt: skip
+_CONFIG_GROUPS = ("preset", "model", "module", "data", "body", "trainer", "seed", "name")
+
+
+class Provenance(Callback):
+    """Adds to every checkpoint what is needed to use it alone.
+
+    Args:
+        config: The resolved configuration, plain values.
+        body_hash: The body's hash.
+        data_licence: What is to be said of the data's licence.
+        run: Name of the run's directory.
+    """
+
+    def __init__(self, config: Mapping[str, Any], body_hash: str, data_licence: str, run: str) -> None:
+        self.content = {
+            "version": CHECKPOINT_VERSION,
+            "config": dict(config),
+            "body_hash": body_hash,
+            "data_licence": data_licence,
+            "run": run,
+        }
+
+    def on_save_checkpoint(
+        self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]
+    ) -> None:
+        """Add the content under its key."""
+        checkpoint[_PROVENANCE_KEY] = self.content
+
+
+class AtomicCheckpointIO(TorchCheckpointIO):
+    """Writes a checkpoint beside its place, then renames it: a killed run leaves the old one or the new one.
+
+    Lightning's own way passes through the system's temporary folder, and from another file system a move is a
+    copy, which can be cut off.
+    """
+
+    def save_checkpoint(
+        self, checkpoint: dict[str, Any], path: str | Path, storage_options: Any = None
+    ) -> None:
+        """Write `checkpoint` to `path`."""
+        draft = f"{path}.{os.getpid()}.tmp"
+        Path(path).parent.mkdir(parents=True, exist_ok=True)
+        try:
+            torch.save(checkpoint, draft)
+            os.replace(draft, path)
+        finally:
+            Path(draft).unlink(missing_ok=True)
 
 
 @dataclass(frozen=True)
@@ -53,17 +109,17 @@ def read_checkpoint(path: str | Path) -> Checkpoint:
         )
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
-    except (RuntimeError, EOFError, OSError, pickle.UnpicklingError, zipfile.BadZipFile, ValueError) as error:
+    except _READ_ERRORS as error:
         reason = str(error).strip().split("\n")[0]
         raise ValueError(
             f"ckpt_path: '{path}' is damaged, truncated or no checkpoint at all ({reason}); copy it again, or "
             "use another one of the run"
         ) from error
-    provenance = content.get(PROVENANCE_KEY) if isinstance(content, dict) else None
-    if not isinstance(provenance, dict) or "state_dict" not in content:
+    provenance: Any = content.get(_PROVENANCE_KEY) if isinstance(content, dict) else None
+    if not _is_ours(content, provenance):
         raise ValueError(
             f"ckpt_path: '{path}' is a PyTorch file, but no checkpoint that a run of this library wrote: it "
-            "carries no configuration"
+            "carries no whole configuration"
         )
     if provenance["version"] > CHECKPOINT_VERSION:
         raise ValueError(
@@ -80,6 +136,27 @@ def read_checkpoint(path: str | Path) -> Checkpoint:
         state=content["state_dict"],
         file_hash=hashlib.sha256(path.read_bytes()).hexdigest()[:16],
     )
+
+
+def _is_ours(content: Any, provenance: Any) -> bool:
+    types = {"version": int, "config": dict, "body_hash": str, "data_licence": str, "run": str}
+    return (
+        isinstance(provenance, dict)
+        and all(isinstance(provenance.get(name), kind) for name, kind in types.items())
+        and all(group in provenance["config"] for group in _CONFIG_GROUPS)
+        # A stored configuration is resolved. An interpolation would be resolved here, on this machine's values.
+        and not _has_interpolation(provenance["config"])
+        and isinstance(content.get("state_dict"), dict)
+        and isinstance(content.get("epoch"), int)
+    )
+
+
+def _has_interpolation(value: Any) -> bool:
+    if isinstance(value, Mapping):
+        return any(_has_interpolation(entry) for entry in value.values())
+    if isinstance(value, list | tuple):
+        return any(_has_interpolation(entry) for entry in value)
+    return isinstance(value, str) and "${" in value
 
 
 def load_state(module: torch.nn.Module, checkpoint: Checkpoint) -> None:

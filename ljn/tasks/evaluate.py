@@ -1,20 +1,25 @@
 """`task=evaluate`: test a checkpoint, with nothing but the checkpoint."""
 
 import logging
-from pathlib import Path
 from typing import Any
 
 import torch
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from omegaconf import DictConfig, OmegaConf, open_dict
+from omegaconf import DictConfig, OmegaConf
 
 from ljn.data import BodyDataModule
 from ljn.tasks import records
 from ljn.tasks.building import build, check_targets
 from ljn.tasks.checkpoints import Checkpoint, load_state, read_checkpoint
-from ljn.tasks.tracking import finish_tracking, link_run
-from ljn.tasks.train import build_trainer, is_multirun, prepare_process, save_config, test
+from ljn.tasks.tracking import tracking
+from ljn.tasks.train import (
+    build_trainer,
+    finite_metrics,
+    prepare_process,
+    save_config,
+    set_run_directory,
+)
 from ljn.tasks.validation import validate
 
 _LOG = logging.getLogger(__name__)
@@ -33,7 +38,6 @@ _FROM_CALL = (
     "rerun",
     "tags",
     "group",
-    "sweep",
 )
 
 
@@ -57,8 +61,8 @@ def evaluate(cfg: DictConfig) -> dict[str, float]:
         raise ValueError("ckpt_path: expected the checkpoint to evaluate, got null; add ckpt_path=FILE")
     checkpoint = read_checkpoint(cfg.ckpt_path)
     overrides = list(HydraConfig.get().overrides.task) if HydraConfig.initialized() else []
-    cfg = with_checkpoint_config(cfg, checkpoint, overrides)
-    validate(cfg, is_multirun=is_multirun())
+    call, cfg = cfg, with_checkpoint_config(cfg, checkpoint, overrides)
+    validate(cfg)
 
     datamodule: BodyDataModule = build(cfg.data)
     datamodule.prepare_data()
@@ -67,12 +71,10 @@ def evaluate(cfg: DictConfig) -> dict[str, float]:
             f"body: the checkpoint was trained with the body {checkpoint.body_hash}, this is "
             f"{datamodule.body.hash}; a model is only meaningful with its body: name it with body.path=FILE"
         )
-    identity = {**records.identity(cfg, datamodule.body.hash), "checkpoint": checkpoint.file_hash}
+    identity = {**records.identity(cfg, datamodule.fingerprint), "checkpoint": checkpoint.file_hash}
     identity_hash = records.config_hash(identity)
-    output_dir = Path(cfg.paths.output_dir)
-    run_dir = records.run_directory(output_dir, "evaluations", cfg.name, cfg.preset.name, identity_hash)
-    with open_dict(cfg):
-        cfg.paths.run_dir = str(run_dir)
+    run_dir = set_run_directory(cfg, "evaluations", identity_hash)
+    call.paths.run_dir = str(run_dir)
 
     prepare_process(cfg)
     module = build(cfg.module)
@@ -89,12 +91,10 @@ def evaluate(cfg: DictConfig) -> dict[str, float]:
         config = save_config(cfg, run_dir)
         trainer = build_trainer(cfg, run_dir, config, datamodule)
         record.add(device=str(trainer.strategy.root_device), num_threads=torch.get_num_threads())
-        link_run(trainer, identity_hash, config, trained_by=checkpoint.run)
-        try:
-            metrics = test(trainer, module, datamodule, ckpt_path=None)
-            records.write_json(run_dir / "metrics.json", metrics)
-        finally:
-            finish_tracking(trainer)
+        with tracking(trainer, identity_hash, config, trained_by=checkpoint.run):
+            trainer.test(module, datamodule, verbose=False)
+            metrics = finite_metrics(trainer)
+        records.write_json(run_dir / "metrics.json", metrics)
     _LOG.info("%s on %s: %s", checkpoint.run, cfg.name, run_dir)
     return metrics
 
@@ -112,16 +112,22 @@ def with_checkpoint_config(cfg: DictConfig, checkpoint: Checkpoint, overrides: l
     """
     check_targets({name: checkpoint.config.get(name) for name in _FROM_CHECKPOINT}, "the checkpoint's config")
     plain: dict[str, Any] = OmegaConf.to_container(cfg, resolve=False)  # type: ignore[assignment]
+    # What belongs to the machine rather than to the numbers stays this call's.
+    of_machine = {
+        "data": {name: plain["data"][name] for name in ("cache_dir", "num_workers", "prefetch_batches")},
+        "trainer": {"accelerator": plain["trainer"]["accelerator"]},
+    }
     plain |= {name: checkpoint.config[name] for name in _FROM_CHECKPOINT}
+    plain |= {name: {**plain[name], **values} for name, values in of_machine.items()}
     merged = OmegaConf.create(plain)
-    merged.data.cache_dir = "${paths.cache_dir}"
     OmegaConf.set_struct(merged, True)
     for override in OverridesParser.create().parse_overrides(overrides):
         key = override.key_or_group.replace("/", ".")
         group = key.split(".")[0]
         if group in _FROM_CALL:
             continue
-        if group not in _OVERRIDABLE or "." not in key:
+        is_value = "/" not in override.key_or_group and not (override.is_delete() or override.is_add())
+        if group not in _OVERRIDABLE or "." not in key or not is_value:
             raise ValueError(
                 f"{override.input_line}: model, data and sizes come from the checkpoint; an evaluation can "
                 f"change single values of {', '.join(_OVERRIDABLE)} (data.keypoint_noise_px=15) and choose "
@@ -132,7 +138,12 @@ def with_checkpoint_config(cfg: DictConfig, checkpoint: Checkpoint, overrides: l
 
 
 def _set(cfg: DictConfig, key: str, value: Any, line: str | None) -> None:
-    if OmegaConf.select(cfg, key, default=_MISSING) is _MISSING:
+    current = OmegaConf.select(cfg, key, default=_MISSING)
+    if isinstance(current, DictConfig):
+        raise ValueError(
+            f"{line}: '{key}' holds several values; change one of them: {', '.join(map(str, current))}"
+        )
+    if current is _MISSING:
         parent = OmegaConf.select(cfg, key.rpartition(".")[0])
         known = ", ".join(sorted(str(name) for name in parent)) if isinstance(parent, DictConfig) else "none"
         raise ValueError(f"{line}: the checkpoint's config has no key '{key}'; known there: {known}")

@@ -23,39 +23,32 @@ from omegaconf import DictConfig, OmegaConf
 
 RECORD_VERSION = 1
 
-# What may differ between two runs that are the same run.
+# What may differ between two runs that are the same run; what data files hold is in the data's fingerprint.
 _NOT_IDENTITY: dict[str, tuple[str, ...]] = {
     "data": ("cache_dir", "num_workers", "prefetch_batches", "body_path", "body_gender"),
-    "trainer": (
-        "accelerator",
-        "devices",
-        "deterministic",
-        "enable_model_summary",
-        "enable_progress_bar",
-        "log_every_n_steps",
-        "num_sanity_val_steps",
-    ),
+    "trainer": ("accelerator", "devices", "enable_model_summary", "log_every_n_steps", "profiler"),
 }
 
 
-def identity(cfg: DictConfig, body_hash: str) -> dict[str, Any]:
-    """Everything that a run's numbers depend on, as plain values."""
+def identity(cfg: DictConfig, data_fingerprint: str) -> dict[str, Any]:
+    """Everything that a run's numbers depend on, as plain values.
+
+    Args:
+        cfg: The composed configuration.
+        data_fingerprint: See `BodyDataModule.fingerprint`.
+    """
     plain: dict[str, Any] = OmegaConf.to_container(cfg, resolve=True)  # type: ignore[assignment]
-    kept: dict[str, Any] = {"seed": plain["seed"], "body": body_hash}
+    kept: dict[str, Any] = {"seed": plain["seed"], "data_fingerprint": data_fingerprint}
     for group in ("data", "model", "module", "trainer"):
         dropped = _NOT_IDENTITY.get(group, ())
         kept[group] = {key: value for key, value in plain[group].items() if key not in dropped}
+    kept["data"].pop("source", None)
     return kept
 
 
 def config_hash(plain: Mapping[str, Any]) -> str:
     """First 8 hex digits of the SHA-256 of plain values, whatever the order of their keys; 10 and 10.0 agree."""
     return hashlib.sha256(json.dumps(_canonical(plain), sort_keys=True).encode()).hexdigest()[:8]
-
-
-def run_directory(output_dir: Path, kind: str, name: str, preset: str, identity_hash: str) -> Path:
-    """`output_dir/kind/NAME-PRESET-HASH`."""
-    return output_dir / kind / f"{name.replace('/', '-')}-{preset}-{identity_hash}"
 
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:

@@ -17,7 +17,7 @@ class Config:
     num_threads: int | None = None
     ckpt_path: str | None = None
     rerun: bool = False
-    optimized_metric: str = "test/mpjpe"
+    optimized_metric: str = "val/mpjpe"
     task: Any = None
     preset: Any = None
     data: Any = None

@@ -1,6 +1,7 @@
 """`task=train`: fit a model, then test its best checkpoint."""
 
 import logging
+import math
 import os
 import warnings
 from pathlib import Path
@@ -8,14 +9,13 @@ from typing import Any
 
 import lightning.pytorch as lightning
 import torch
-from hydra.core.hydra_config import HydraConfig
-from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf, open_dict
 
 from ljn.data import BodyDataModule
 from ljn.tasks import records
 from ljn.tasks.building import build, build_each
-from ljn.tasks.tracking import finish_tracking, link_run
+from ljn.tasks.checkpoints import AtomicCheckpointIO, Provenance, read_checkpoint
+from ljn.tasks.tracking import tracking
 from ljn.tasks.validation import validate
 
 _LOG = logging.getLogger(__name__)
@@ -35,30 +35,34 @@ def train(cfg: DictConfig) -> dict[str, float]:
         cfg: The composed configuration; `paths.run_dir` is set here.
 
     Returns:
-        The test metrics, also in `metrics.json` of the run's directory.
+        The best checkpoint's validation and test metrics, also in `metrics.json` of the run's directory.
 
     Raises:
         ValueError: The configuration or the data it names is wrong; nothing expensive has been started then.
         FileNotFoundError: A file that it names is missing.
+        FloatingPointError: The loss or a metric is not finite.
     """
-    validate(cfg, is_multirun=is_multirun())
+    if cfg.ckpt_path is not None:
+        raise ValueError(
+            "ckpt_path: it is what task=evaluate reads; a training resumes from its own directory by itself"
+        )
+    validate(cfg)
     datamodule: BodyDataModule = build(cfg.data)
     datamodule.prepare_data()
-    identity = records.identity(cfg, datamodule.body.hash)
-    identity_hash = records.config_hash(identity)
-    output_dir = Path(cfg.paths.output_dir)
-    run_dir = records.run_directory(output_dir, "runs", cfg.name, cfg.preset.name, identity_hash)
-    with open_dict(cfg):
-        cfg.paths.run_dir = str(run_dir)
+    identity_hash = records.config_hash(records.identity(cfg, datamodule.fingerprint))
+    run_dir = set_run_directory(cfg, "runs", identity_hash)
     if records.is_complete(run_dir, identity_hash) and not cfg.rerun:
         _LOG.info("%s is complete; train it again with rerun=true", run_dir)
         return records.read_json(run_dir / "metrics.json") or {}
 
     prepare_process(cfg)
     module = build(cfg.module)
-    last = run_dir / "checkpoints" / "last.ckpt"
+    last, best = (run_dir / "checkpoints" / f"{name}.ckpt" for name in ("last", "best"))
     if cfg.rerun:
         last.unlink(missing_ok=True)
+    resumes = last.is_file()
+    if resumes:
+        read_checkpoint(last)  # a damaged one is named before anything starts
     facts = {
         "name": cfg.name,
         "preset": cfg.preset.name,
@@ -70,23 +74,31 @@ def train(cfg: DictConfig) -> dict[str, float]:
         config = save_config(cfg, run_dir)
         trainer = build_trainer(cfg, run_dir, config, datamodule)
         record.add(device=str(trainer.strategy.root_device), num_threads=torch.get_num_threads())
-        link_run(trainer, identity_hash, config)
-        try:
-            if last.is_file():
-                _LOG.info("resuming from %s", last)
-            else:
-                _LOG.info("training in %s", run_dir)
-            trainer.fit(module, datamodule, ckpt_path=last if last.is_file() else None, weights_only=True)
-            best = run_dir / "checkpoints" / "best.ckpt"
+        _LOG.info("resuming from %s" if resumes else "training in %s", last if resumes else run_dir)
+        # The fixed sets first: what is wrong with them should not come up after the training.
+        datamodule.setup("fit")
+        datamodule.setup("test")
+        with tracking(trainer, identity_hash, config):
+            trainer.fit(module, datamodule, ckpt_path=last if resumes else None, weights_only=True)
             if trainer.global_step == 0 or not best.is_file():
                 # Without optimizer steps (a yardstick) or without validation, nothing was saved yet.
                 trainer.save_checkpoint(best, weights_only=False)
             record.add(checkpoint=str(best.relative_to(run_dir)))
-            metrics = test(trainer, module, datamodule, best)
-            records.write_json(run_dir / "metrics.json", metrics)
-        finally:
-            finish_tracking(trainer)
+            trainer.validate(module, datamodule, ckpt_path=best, verbose=False, weights_only=True)
+            metrics = finite_metrics(trainer)
+            trainer.test(module, datamodule, ckpt_path=best, verbose=False, weights_only=True)
+            metrics |= finite_metrics(trainer)
+        records.write_json(run_dir / "metrics.json", metrics)
     return metrics
+
+
+def set_run_directory(cfg: DictConfig, kind: str, identity_hash: str) -> Path:
+    """Name the directory `output_dir/kind/NAME-PRESET-HASH` and make it `paths.run_dir`."""
+    name = f"{cfg.name.replace('/', '-')}-{cfg.preset.name}-{identity_hash}"
+    run_dir = Path(cfg.paths.output_dir) / kind / name
+    with open_dict(cfg):
+        cfg.paths.run_dir = str(run_dir)
+    return run_dir
 
 
 def prepare_process(cfg: DictConfig) -> None:
@@ -96,33 +108,41 @@ def prepare_process(cfg: DictConfig) -> None:
         warnings.filterwarnings("ignore", message)
     lightning.seed_everything(cfg.seed, workers=True, verbose=False)
     # With a thread on every core, each parallel region waits for the one that shares its core with a worker.
-    torch.set_num_threads(cfg.num_threads or max(1, (os.cpu_count() or 1) // 2))
+    torch.set_num_threads(cfg.num_threads or max(1, _num_cores() // 2))
+
+
+def _num_cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def build_trainer(
     cfg: DictConfig, run_dir: Path, config: dict[str, Any], datamodule: BodyDataModule
 ) -> lightning.Trainer:
     """The trainer with its callbacks and loggers, writing below the run's directory."""
-    from callbacks.provenance import Provenance
-
     provenance = Provenance(config, datamodule.body.hash, datamodule.licence, run_dir.name)
     return build(
         cfg.trainer,
         default_root_dir=str(run_dir),
         callbacks=[*build_each(cfg.callbacks), provenance],
         logger=build_each(cfg.logger),
+        plugins=[AtomicCheckpointIO()],
     )
 
 
-def test(
-    trainer: lightning.Trainer,
-    module: lightning.LightningModule,
-    datamodule: BodyDataModule,
-    ckpt_path: Path | None,
-) -> dict[str, float]:
-    """The test metrics of a checkpoint, or of the module as it is."""
-    [metrics] = trainer.test(module, datamodule, ckpt_path=ckpt_path, verbose=False, weights_only=True)
-    return {name: float(value) for name, value in metrics.items()}
+def finite_metrics(trainer: lightning.Trainer) -> dict[str, float]:
+    """The metrics of the trainer's last validation or test.
+
+    Raises:
+        FloatingPointError: One of them is not finite.
+    """
+    metrics = {name: float(value) for name, value in trainer.callback_metrics.items()}
+    bad = [name for name, value in metrics.items() if not math.isfinite(value)]
+    if bad:
+        raise FloatingPointError(
+            f"{', '.join(bad)} not finite: the model predicts NaN or infinity; lower the learning rate"
+        )
+    return metrics
 
 
 def save_config(cfg: DictConfig, run_dir: Path) -> dict[str, Any]:
@@ -130,8 +150,3 @@ def save_config(cfg: DictConfig, run_dir: Path) -> dict[str, Any]:
     config: dict[str, Any] = OmegaConf.to_container(cfg, resolve=True)  # type: ignore[assignment]
     (run_dir / "config.yaml").write_text(OmegaConf.to_yaml(OmegaConf.create(config)))
     return config
-
-
-def is_multirun() -> bool:
-    """Whether Hydra runs a sweep."""
-    return HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN

@@ -10,10 +10,8 @@ from omegaconf.errors import OmegaConfBaseException
 from ljn.body.skeleton import JOINT_NAMES, NUM_JOINTS
 from ljn.tasks.building import check_targets
 
-_MULTI_PROCESS = ("ddp", "fsdp", "deepspeed")
 
-
-def validate(cfg: DictConfig, is_multirun: bool = False) -> None:
+def validate(cfg: DictConfig) -> None:
     """Raise a `ValueError` that names the key, what was expected, what came and the fix."""
     try:
         plain: dict[str, Any] = OmegaConf.to_container(cfg, resolve=True, throw_on_missing=True)  # type: ignore[assignment]
@@ -21,20 +19,19 @@ def validate(cfg: DictConfig, is_multirun: bool = False) -> None:
         raise ValueError(f"config: {error}".split("\n")[0]) from error
     check_targets(plain)
     _check_radii(plain.get("model") or {})
-    _check_positive(plain)
+    _check_integers(plain)
     _check_monitors(plain)
-    trainer = plain["trainer"]
-    strategy = str(trainer.get("strategy") or "")
-    devices = trainer.get("devices")
-    if is_multirun and (strategy.startswith(_MULTI_PROCESS) or (isinstance(devices, int) and devices > 1)):
+    devices = plain["trainer"].get("devices")
+    if devices not in (1, "1"):
         raise ValueError(
-            f"trainer: several processes (strategy='{strategy or 'auto'}', devices={devices}) do not go with "
-            "a multirun, whose every child process would start the sweep again; use trainer.devices=1"
+            f"trainer.devices: a run uses one device, got {devices!r}; start several runs for several devices "
+            "(each process of a multi-device run would write the same records)"
         )
-    check_writable(Path(plain["paths"]["output_dir"]))
+    for name in ("output_dir", "cache_dir"):
+        check_writable(Path(plain["paths"][name]), f"paths.{name}")
 
 
-def check_writable(directory: Path) -> None:
+def check_writable(directory: Path, name: str = "paths.output_dir") -> None:
     """Raise a `ValueError` unless files can be written in a directory, made where it is missing."""
     try:
         directory.mkdir(parents=True, exist_ok=True)
@@ -42,31 +39,38 @@ def check_writable(directory: Path) -> None:
             pass
     except OSError as error:
         raise ValueError(
-            f"paths.output_dir: cannot write in '{directory}' ({error.strerror}); choose another one with "
-            "paths.output_dir=DIRECTORY"
+            f"{name}: cannot write in '{directory}' ({error.strerror}); choose another one with {name}=DIRECTORY"
         ) from error
 
 
 def _check_radii(model: dict[str, Any]) -> None:
     radii = model.get("radii_m")
-    if radii is not None and len(radii) != NUM_JOINTS:
+    if "radii_m" in model and not (isinstance(radii, list) and len(radii) == NUM_JOINTS):
+        got = len(radii) if isinstance(radii, list) else repr(radii)
         raise ValueError(
-            f"model.radii_m: expected {NUM_JOINTS} radii, one for each joint ({', '.join(JOINT_NAMES)}), got "
-            f"{len(radii)}"
+            f"model.radii_m: expected {NUM_JOINTS} radii, one for each joint ({', '.join(JOINT_NAMES)}), got {got}"
         )
 
 
-def _check_positive(plain: dict[str, Any]) -> None:
-    checked = {
-        "data": ("num_points", "num_train", "num_val", "num_test", "batch_size"),
-        "model": ("group_size",),
-        "trainer": ("max_epochs",),
+def _check_integers(plain: dict[str, Any]) -> None:
+    smallest: dict[int, dict[str, tuple[str, ...]]] = {
+        1: {
+            "data": ("num_points", "num_train", "num_val", "num_test", "batch_size", "prefetch_batches"),
+            "model": ("group_size",),
+            "trainer": ("max_epochs",),
+        },
+        0: {"data": ("num_workers", "seed", "pool_seed", "eval_seed")},
     }
-    for group, keys in checked.items():
-        for key in keys:
-            value = (plain.get(group) or {}).get(key)
-            if value is not None and not (isinstance(value, int) and value > 0):
-                raise ValueError(f"{group}.{key}: expected a positive integer, got {value!r}")
+    for least, groups in smallest.items():
+        for group, keys in groups.items():
+            for key in keys:
+                values = plain.get(group) or {}
+                if key in values and not (isinstance(values[key], int) and values[key] >= least):
+                    raise ValueError(
+                        f"{group}.{key}: expected an integer of {least} or more, got {values[key]!r}"
+                    )
+    if plain["num_threads"] is not None and plain["num_threads"] < 1:
+        raise ValueError(f"num_threads: expected 1 or more, or null, got {plain['num_threads']}")
 
 
 def _check_monitors(plain: dict[str, Any]) -> None:

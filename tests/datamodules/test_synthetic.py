@@ -316,3 +316,17 @@ def test_a_workers_memory_does_not_grow(train_loader):
         after = resident_mb(worker.pid)
     print(f"the worker's memory: {before:.1f} MB after 480 samples, {after:.1f} MB after 2480")
     assert after - before < 50
+
+
+def test_without_redrawing_every_epoch_shows_the_same_samples_in_another_order(make_datamodule):
+    datamodule = make_datamodule(redraw_each_epoch=False)
+    datamodule.setup("fit")
+    loader = datamodule.train_dataloader()
+    epochs = []
+    for epoch in (0, 1):
+        loader.batch_sampler.sampler.set_epoch(epoch)
+        batches = list(loader)
+        order = torch.cat([batch["sample_id"] for batch in batches])
+        epochs.append((order, torch.cat([batch["points"] for batch in batches])[order.argsort()]))
+    assert not torch.equal(epochs[0][0], epochs[1][0])
+    torch.testing.assert_close(epochs[0][1], epochs[1][1], atol=1e-5, rtol=0)

@@ -51,6 +51,10 @@ def test_presets_have_the_same_keys():
     assert len({tuple(value) for value in keys.values()}) == 1, keys
 
 
+def test_the_cosine_of_the_small_preset_ends_with_the_training(compose_config):
+    assert compose_config("preset=small", "trainer.max_epochs=20").module.scheduler.T_max == 20
+
+
 def test_the_thesis_preset_holds_the_specs_numbers(compose_config):
     cfg = compose_config("preset=thesis", "experiment=detector/proposed")
     assert (cfg.data.num_points, cfg.data.num_train, cfg.data.num_val, cfg.data.num_test) == (
@@ -82,7 +86,13 @@ def test_a_value_of_the_wrong_type_is_rejected(compose_config):
             ["model.radii_m=[0.2,0.3]"],
             r"model\.radii_m: expected 24 radii, one for each joint \(pelvis.*got 2",
         ),
-        (["data.num_points=0"], r"data\.num_points: expected a positive integer, got 0"),
+        (["model.radii_m=0.2"], r"model\.radii_m: expected 24 radii.*got 0\.2"),
+        (["data.num_points=0"], r"data\.num_points: expected an integer of 1 or more, got 0"),
+        (["data.batch_size=null"], r"data\.batch_size: expected an integer of 1 or more, got None"),
+        (["data.num_workers=-1"], r"data\.num_workers: expected an integer of 0 or more, got -1"),
+        (["data.eval_seed=-1"], r"data\.eval_seed: expected an integer of 0 or more, got -1"),
+        (["num_threads=-2"], r"num_threads: expected 1 or more, or null, got -2"),
+        (["paths.cache_dir=/dev/null/x"], r"paths\.cache_dir: cannot write in '/dev/null/x'"),
         (["callbacks.best.monitor=val/mjpe"], r"callbacks\.best\.monitor: no metric 'val/mjpe'.*val/mpjpe"),
         (["model._target_=os.system"], r"model: `_target_: os\.system` is outside the modules"),
         (
@@ -97,13 +107,26 @@ def test_what_types_cannot_say_is_validated(overrides, message, compose_config, 
         validate(cfg)
 
 
-def test_several_processes_in_a_multirun_are_refused(compose_config, tmp_path):
-    cfg = compose_config(f"paths.output_dir={tmp_path}", "trainer.devices=2")
-    validate(cfg)
-    with pytest.raises(
-        ValueError, match=r"several processes .* do not go with a multirun.*trainer\.devices=1"
-    ):
-        validate(cfg, is_multirun=True)
+@pytest.mark.parametrize("devices", ["2", "-1", "auto", "[0,1]"])
+def test_several_devices_are_refused(devices, compose_config, tmp_path):
+    cfg = compose_config(f"paths.output_dir={tmp_path}", f"trainer.devices={devices}")
+    with pytest.raises(ValueError, match=r"trainer\.devices: a run uses one device"):
+        validate(cfg)
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("data.distance_m=2", "distance_m: expected two numbers, nearest and farthest, got 2"),
+        ("data.distance_m=[1.5]", "distance_m: expected two numbers"),
+        ("data.distance_m=[3,1]", "distance_m: expected 0 < nearest <= farthest"),
+        ("data.depth_noise_m=nan", "depth_noise_m: expected a number of 0 or more, got nan"),
+        ("data.margin_px=300", "margin_px: a clear border of 300"),
+    ],
+)
+def test_bad_values_of_the_data_are_named_when_it_is_built(override, message, compose_config):
+    with pytest.raises(ValueError, match=message):
+        build(compose_config(override).data)
 
 
 def test_a_directory_below_a_file_cannot_be_written(tmp_path):
@@ -140,12 +163,13 @@ def test_an_error_in_a_constructor_keeps_its_type_and_message(compose_config):
         build(cfg.data)
 
 
-def test_no_config_reaches_an_object(compose_config):
+def test_no_config_reaches_an_object(compose_config, tmp_path):
     from omegaconf import DictConfig, ListConfig
 
-    cfg = compose_config("experiment=detector/proposed")
+    cfg = compose_config("experiment=detector/proposed", f"paths.run_dir={tmp_path}", "tags=[a,b]")
     module = build(cfg.module)
     datamodule = build(cfg.data)
-    for owner in (module, module.net, datamodule, datamodule.settings, datamodule.source):
+    parts = [*build_each(cfg.callbacks), *build_each(cfg.logger), datamodule.settings.camera]
+    for owner in (module, module.net, datamodule, datamodule.settings, datamodule.source, *parts):
         for name, value in vars(owner).items():
             assert not isinstance(value, DictConfig | ListConfig), name

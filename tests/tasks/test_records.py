@@ -80,7 +80,7 @@ def test_a_run_is_complete_only_with_its_own_hash_and_metrics(tmp_path):
 
 def test_the_identity_ignores_paths_loggers_and_workers(compose_config):
     def hash_of(*overrides):
-        return config_hash(identity(compose_config("experiment=detector/proposed", *overrides), "body"))
+        return config_hash(identity(compose_config("experiment=detector/proposed", *overrides), "data"))
 
     same = hash_of()
     for override in (
@@ -93,6 +93,7 @@ def test_the_identity_ignores_paths_loggers_and_workers(compose_config):
         "num_threads=3",
         "preset.name=other",
         "data.keypoint_noise_px=10.0",
+        "data.source.path=the_same_content_elsewhere.npz",
     ):
         assert hash_of(override) == same, override
     for override in (

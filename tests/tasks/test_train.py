@@ -17,7 +17,7 @@ from ljn.tasks import train as train_task
 from ljn.tasks.train import train
 
 ROOT = Path(__file__).parents[2]
-KEYS = {
+NAMES = {
     "test/mpjpe",
     "test/mpjpe_eq38",
     "test/mpjpe_root_aligned",
@@ -28,6 +28,9 @@ KEYS = {
     "test/initial_mean_distance_px",
     "test/initial_max_distance_px",
 }
+
+
+KEYS = NAMES | {name.replace("test/", "val/") for name in NAMES}
 
 
 def weights(run_dir):
@@ -53,7 +56,9 @@ def test_a_run_leaves_its_files(trained):
     ]
     with (run_dir / "csv" / "version_0" / "metrics.csv").open() as file:
         rows = list(csv.DictReader(file))
-    assert len([row for row in rows if row["val/mpjpe"]]) == 2
+    # Two epochs, and the best checkpoint at the end.
+    assert len([row for row in rows if row["val/mpjpe"]]) == 3
+    assert rows[-1]["test/mpjpe"]
 
 
 def test_sample_errors_give_the_metrics_again(trained):
@@ -132,6 +137,13 @@ def test_a_yardstick_is_fitted_tested_and_kept(name, smoke_config, tmp_path):
     state = torch.load(Path(cfg.paths.run_dir) / "checkpoints" / "best.ckpt", weights_only=True)["state_dict"]
     assert state["net.bias"].any()
     assert state["net.gram"][-1, -1] == 32
+    assert metrics["val/mpjpe"] != metrics["val/initial_mpjpe"]
+
+
+def test_a_yardstick_is_fitted_without_validation_too(smoke_config, tmp_path):
+    cfg = smoke_config(tmp_path, "experiment=detector/mean_offset", "trainer.limit_val_batches=0")
+    metrics = train(cfg)
+    assert metrics["test/mpjpe"] != metrics["test/initial_mpjpe"]
 
 
 @pytest.mark.parametrize(
@@ -145,7 +157,42 @@ def test_a_yardstick_is_fitted_tested_and_kept(name, smoke_config, tmp_path):
 def test_bad_input_ends_a_run_before_it_starts(override, error, message, smoke_config, tmp_path):
     with pytest.raises(error, match=message):
         train(smoke_config(tmp_path, "experiment=detector/proposed", override))
-    assert not list((tmp_path / "runs").glob("*/record.json")) if (tmp_path / "runs").exists() else True
+    assert not list(tmp_path.glob("runs/*"))
+
+
+def test_a_checkpoint_is_not_for_training(smoke_config, tmp_path):
+    with pytest.raises(ValueError, match="ckpt_path: it is what task=evaluate reads"):
+        train(smoke_config(tmp_path, "ckpt_path=some.ckpt"))
+
+
+def test_a_damaged_checkpoint_to_resume_from_is_named(smoke_config, tmp_path):
+    cfg = smoke_config(tmp_path, "experiment=detector/basic", "trainer.max_epochs=1")
+    train(cfg)
+    run_dir = Path(cfg.paths.run_dir)
+    (run_dir / "record.json").unlink()
+    (run_dir / "checkpoints" / "last.ckpt").write_bytes(b"half a")
+    with pytest.raises(ValueError, match=r"last\.ckpt' is damaged"):
+        train(cfg)
+
+
+def test_another_content_of_the_pose_file_is_another_run(smoke_config, tmp_path):
+    from ljn.tasks import records
+    from ljn.tasks.building import build
+
+    hashes = []
+    for value in (0.0, 0.1):
+        clips = np.array(["a", "b", "c"])
+        np.savez(tmp_path / "poses.npz", poses=np.full((3, 72), value), clip=clips)
+        (tmp_path / "split.json").write_text('{"train": ["a"], "val": ["b"], "test": ["c"]}')
+        files = (
+            f"data.source.path={tmp_path / 'poses.npz'}",
+            f"data.source.split_path={tmp_path / 'split.json'}",
+        )
+        cfg = smoke_config(tmp_path, *files)
+        datamodule = build(cfg.data)
+        assert "own file poses.npz" in datamodule.licence
+        hashes.append(records.config_hash(records.identity(cfg, datamodule.fingerprint)))
+    assert hashes[0] != hashes[1]
 
 
 def test_poses_with_nan_end_a_run_before_it_starts(smoke_config, tmp_path):
