@@ -92,11 +92,12 @@ def draw_report(rows: dict[str, float], best: str, page: Path) -> "Figure":
     from matplotlib.image import imread
 
     picture = imread(page) if page.is_file() else None
-    figure = Figure(figsize=(13, 2.6 + (10.4 if picture is not None else 0)), dpi=100, layout="constrained")
+    width, heights = 12.0, [0.8 + 0.35 * len(rows)]
+    if picture is not None:
+        heights.append(0.3 + width * picture.shape[0] / picture.shape[1])
+    figure = Figure(figsize=(width, sum(heights)), dpi=100, layout="constrained")
     FigureCanvasAgg(figure)
-    axes = figure.subplots(
-        2 if picture is not None else 1, squeeze=False, height_ratios=[1, 5][: 1 + (picture is not None)]
-    )
+    axes = figure.subplots(len(heights), squeeze=False, height_ratios=heights)
     bars = axes[0, 0]
     names = list(rows)
     drawn = bars.barh(
