@@ -31,6 +31,7 @@ def tracking(
         for logger in trainer.loggers:
             if isinstance(logger, WandbLogger):
                 logger._wandb_init.update(id=run_id, resume="allow")
+                logger._wandb_init.pop("anonymous", None)  # of no effect, and W&B warns of it
             logger.log_hyperparams({**config, "trained_by": trained_by} if trained_by else dict(config))
         yield
         exit_code = 0
