@@ -347,12 +347,12 @@ def test_poses_without_a_heading_of_their_own_cannot_keep_it(make):
     [
         ({"num_points": 0}, "num_points: expected at least 1, got 0"),
         ({"heading": "front"}, "heading: expected one of source, histogram, uniform, got 'front'"),
-        ({"renderer": "opengl"}, "renderer: expected one of auto, zbuffer, open3d, got 'opengl'"),
+        ({"renderer": "opengl"}, "renderer: expected one of auto, zbuffer, pyrender, open3d, got 'opengl'"),
         ({"distance_m": (0.0, 2.0)}, "distance_m: expected 0 < nearest <= farthest"),
         ({"distance_m": (3.0, 2.0)}, "distance_m: expected 0 < nearest <= farthest"),
-        ({"margin_px": -1.0}, "margin_px: expected 0 or more, got -1"),
-        ({"depth_noise_m": -0.1}, "depth_noise_m: expected 0 or more"),
-        ({"keypoint_noise_px": -5.0}, "keypoint_noise_px: expected 0 or more"),
+        ({"margin_px": -1.0}, "margin_px: expected a number of 0 or more, got -1"),
+        ({"depth_noise_m": -0.1}, "depth_noise_m: expected a number of 0 or more"),
+        ({"keypoint_noise_px": -5.0}, "keypoint_noise_px: expected a number of 0 or more"),
     ],
 )
 def test_impossible_settings_are_errors_before_anything_is_rendered(kinect, change, message):
