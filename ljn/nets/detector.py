@@ -1,5 +1,7 @@
 """What every joint detector shares: the centred frame and the meaning of the output."""
 
+from abc import ABC, abstractmethod
+
 import torch
 from torch import Tensor, nn
 
@@ -11,7 +13,7 @@ def cloud_centre(points: Tensor) -> Tensor:
     return points[..., :3].mean(1, keepdim=True)
 
 
-class Detector(nn.Module):
+class Detector(nn.Module, ABC):
     """Base of the joint detectors: cloud and initial joints in, joints out, all in the camera frame.
 
     Everything is centred on the cloud's mean first, so a detector does not see where the person stands.
@@ -43,6 +45,6 @@ class Detector(nn.Module):
         prediction = self.regress(points, joints)
         return prediction + (initial_joints if self.output == "offset" else centre)
 
+    @abstractmethod
     def regress(self, points: Tensor, initial_joints: Tensor) -> Tensor:
         """`(B, N, C)`, `(B, 24, 3)`, centred -> `(B, 24, 3)`: offsets or positions, as `output` says."""
-        raise NotImplementedError

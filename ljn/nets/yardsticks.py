@@ -4,6 +4,8 @@ Both are fitted in closed form from sums over the training samples: `accumulate`
 A network that does not beat `Ridge` has learned nothing from the cloud.
 """
 
+from abc import abstractmethod
+
 import torch
 from torch import Tensor
 
@@ -35,9 +37,9 @@ class Yardstick(Detector):
         self.gram += inputs.T @ inputs
         self.moment += inputs.T @ (joints - initial_joints).flatten(1).double()
 
+    @abstractmethod
     def solve(self) -> None:
         """Fit the weights to what was accumulated."""
-        raise NotImplementedError
 
     def regress(self, points: Tensor, initial_joints: Tensor) -> Tensor:
         """See `Detector.regress`."""

@@ -177,7 +177,7 @@ from ljn.metrics import JointMetrics
 folder, rank = sys.argv[1], int(sys.argv[2])
 torch.set_num_threads(1)
 dist.init_process_group("gloo", init_method=f"file://{folder}/init", rank=rank, world_size=2)
-batch = torch.load(f"{folder}/batch.pt")
+batch = torch.load(f"{folder}/batch.pt", weights_only=True)
 metrics = JointMetrics()
 # Unequal shares, in a different number of batches.
 for rows in ([slice(0, 4), slice(4, 5)], [slice(5, 13)])[rank]:
