@@ -4,40 +4,17 @@ import warnings
 from collections.abc import Callable
 from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any
 
-import numpy as np
 import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.loggers import WandbLogger
 from lightning.pytorch.trainer.states import TrainerFn
 from torch import Tensor
 
-from ljn.body.skeleton import BONES
 from ljn.data import Batch
+from ljn.drawing import Sample, draw_samples
 from ljn.metrics.functional import mpjpe
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-
-_TRUE, _PREDICTED, _CLOUD = "#1f5fd6", "#d62728", "#b9bec6"
-
-
-class Sample(NamedTuple):
-    """What is drawn of a sample; camera frame, metres.
-
-    Attributes:
-        points: `(N, 3)`.
-        joints: `(24, 3)`, the truth.
-        pred_joints: `(24, 3)`.
-        title: Text above it.
-    """
-
-    points: np.ndarray
-    joints: np.ndarray
-    pred_joints: np.ndarray
-    title: str
 
 
 def _never_stops(hook: Callable[..., None]) -> Callable[..., None]:
@@ -170,57 +147,3 @@ def _sample(batch: Batch, pred_joints: Tensor, row: int, title: str) -> Sample:
     tensors = (batch["points"][row, :, :3], batch["joints"][row], pred_joints[row])
     points, joints, predicted = (tensor.detach().cpu().numpy() for tensor in tensors)
     return Sample(points, joints, predicted, title)
-
-
-def draw_samples(samples: list[Sample], num_columns: int) -> "Figure":
-    """A page of samples, each from the front (the camera's view) and from the side.
-
-    Args:
-        samples: What to draw, in reading order.
-        num_columns: Samples in a row.
-
-    Returns:
-        A matplotlib figure, made without a display.
-    """
-    # Not through pyplot: its figures belong to a global state and, on some machines, to a screen.
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    num_rows = -(-len(samples) // num_columns)
-    figure = Figure(figsize=(3.8 * num_columns, 2.3 * num_rows + 0.3), dpi=100, layout="constrained")
-    FigureCanvasAgg(figure)
-    axes = figure.subplots(num_rows, 2 * num_columns, squeeze=False)
-    for axis in axes.flat:
-        axis.set_axis_off()
-    for number, sample in enumerate(samples):
-        row, column = divmod(number, num_columns)
-        front, side = axes[row, 2 * column], axes[row, 2 * column + 1]
-        _draw_view(front, sample, horizontal=0)
-        _draw_view(side, sample, horizontal=2)
-        front.set_title(sample.title, fontsize=9, loc="left")
-    figure.legend(
-        handles=[
-            axes[0, 0].plot([], [], color=_TRUE, lw=2, label="true")[0],
-            axes[0, 0].plot([], [], color=_PREDICTED, lw=2, label="predicted")[0],
-        ],
-        loc="outside lower center",
-        ncols=2,
-        fontsize=9,
-        frameon=False,
-    )
-    return figure
-
-
-def _draw_view(axis: "Axes", sample: Sample, horizontal: int) -> None:
-    """One view: `horizontal` is the camera axis that goes to the right (0 from the front, 2 from the side)."""
-    axis.scatter(sample.points[:, horizontal], sample.points[:, 1], s=0.6, c=_CLOUD, linewidths=0)
-    for joints, colour in ((sample.joints, _TRUE), (sample.pred_joints, _PREDICTED)):
-        for parent, joint in BONES:
-            ends = joints[[parent, joint]]
-            axis.plot(ends[:, horizontal], ends[:, 1], color=colour, lw=1.6, solid_capstyle="round")
-    everything = np.concatenate([sample.points, sample.joints, sample.pred_joints])
-    centre = (everything.min(0) + everything.max(0)) / 2
-    half = 0.52 * float(np.ptp(everything, axis=0).max())
-    axis.set_xlim(centre[horizontal] - half, centre[horizontal] + half)
-    axis.set_ylim(centre[1] + half, centre[1] - half)  # y points down
-    axis.set_aspect("equal")

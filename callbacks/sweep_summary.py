@@ -7,6 +7,7 @@ from hydra.core.utils import JobReturn, JobStatus
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig
 
+from ljn.drawing import new_figure
 from ljn.tasks.records import read_json, write_json
 
 if TYPE_CHECKING:
@@ -87,16 +88,13 @@ def draw_report(rows: dict[str, float], best: str, page: Path) -> "Figure":
         best: The name to stress.
         page: Picture of test samples.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
     from matplotlib.image import imread
 
     picture = imread(page) if page.is_file() else None
     width, heights = 12.0, [0.8 + 0.35 * len(rows)]
     if picture is not None:
         heights.append(0.3 + width * picture.shape[0] / picture.shape[1])
-    figure = Figure(figsize=(width, sum(heights)), dpi=100, layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = new_figure(width, sum(heights))
     axes = figure.subplots(len(heights), squeeze=False, height_ratios=heights)
     bars = axes[0, 0]
     names = list(rows)

@@ -4,7 +4,7 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 import torch
@@ -117,9 +117,21 @@ class DepthSynthesizer:
     def _rng(self, epoch: int, index: int, purpose: int) -> np.random.Generator:
         return np.random.default_rng([*self.seed_key, epoch, index, purpose])
 
-    @torch.no_grad()
     def batch(self, keys: Sequence[tuple[int, int]]) -> Batch:
-        """The samples of `keys`, each an epoch and a record's index; every sample depends on its key alone."""
+        """The samples of `keys`, each an epoch and a record's index.
+
+        A sample depends on its key alone; in float32 up to the rounding of products over a batch.
+        """
+        return self._observe(keys, self._render(keys))
+
+    def examples(self, keys: Sequence[tuple[int, int]]) -> tuple[Batch, Tensor]:
+        """The samples of `keys` with the noisy depth images `(B, H, W)`, metres, that they were taken from."""
+        scene = self._render(keys)
+        return self._observe(keys, scene), torch.from_numpy(scene.depth)
+
+    @torch.no_grad()
+    def _render(self, keys: Sequence[tuple[int, int]]) -> "_Scene":
+        """Pose the bodies, place them before the camera, take noisy depth images."""
         settings, camera = self.settings, self.settings.camera
         placement = [self._rng(epoch, index, _PLACEMENT) for epoch, index in keys]
         rows = [index for _, index in keys]
@@ -141,34 +153,50 @@ class DepthSynthesizer:
             )
         ).to(self.dtype)
         vertices, joints = vertices + transl[:, None], joints + transl[:, None]
-        intrinsics = camera.intrinsics(self.dtype).expand(len(keys), 4)
-        keypoints = project(joints, intrinsics).float()
 
         depth = self._renderer(vertices, self._smpl.faces, camera).numpy()
+        for image, (epoch, index) in zip(depth, keys):
+            image[:] = add_depth_noise(image, settings.depth_noise_m, self._rng(epoch, index, _DEPTH_NOISE))
+        return _Scene(pose, betas, joints, depth)
+
+    def _observe(self, keys: Sequence[tuple[int, int]], scene: "_Scene") -> Batch:
+        """Sample the depth images to clouds with normals; make the initial joints."""
+        settings, camera = self.settings, self.settings.camera
+        intrinsics = camera.intrinsics(self.dtype).expand(len(keys), 4)
+        keypoints = project(scene.joints, intrinsics).float()
         points = np.empty((len(keys), settings.num_points, 6), np.float32)
-        noisy_keypoints = np.empty((len(keys), *keypoints.shape[1:]), np.float32)
-        initial_joints = np.empty((len(keys), *joints.shape[1:]), np.float32)
+        noisy_keypoints = np.empty(keypoints.shape, np.float32)
+        initial_joints = np.empty(scene.joints.shape, np.float32)
         for i, (epoch, index) in enumerate(keys):
-            noisy = add_depth_noise(depth[i], settings.depth_noise_m, self._rng(epoch, index, _DEPTH_NOISE))
-            cloud = sample_cloud(noisy, camera, settings.num_points, self._rng(epoch, index, _SAMPLING))
+            depth = scene.depth[i]
+            cloud = sample_cloud(depth, camera, settings.num_points, self._rng(epoch, index, _SAMPLING))
             points[i, :, :3] = cloud.points
-            points[i, :, 3:] = self._normals(cloud, noisy, camera)
+            points[i, :, 3:] = self._normals(cloud, depth, camera)
             noisy_keypoints[i] = add_keypoint_noise(
                 keypoints[i].numpy(), settings.keypoint_noise_px, camera, self._rng(epoch, index, _KEYPOINTS)
             )
-            initial_joints[i] = lift_keypoints(noisy_keypoints[i], noisy, camera)
+            initial_joints[i] = lift_keypoints(noisy_keypoints[i], depth, camera)
         return Batch(
             points=torch.from_numpy(points),
             keypoints_2d=keypoints,
             noisy_keypoints_2d=torch.from_numpy(noisy_keypoints),
             initial_joints=torch.from_numpy(initial_joints),
-            joints=joints.float(),
-            pose=pose.float(),
-            betas=betas.float(),
+            joints=scene.joints.float(),
+            pose=scene.pose.float(),
+            betas=scene.betas.float(),
             gender=torch.full((len(keys),), GENDERS[self.body.gender]),
             camera=intrinsics.float(),
-            sample_id=torch.tensor(rows),
+            sample_id=torch.tensor([index for _, index in keys]),
         )
+
+
+class _Scene(NamedTuple):
+    """Bodies before the camera: `(B, 72)`, `(B, 10)`, `(B, 24, 3)` and noisy depth `(B, H, W)`, metres."""
+
+    pose: Tensor
+    betas: Tensor
+    joints: Tensor
+    depth: np.ndarray
 
 
 def add_keypoint_noise(

@@ -133,6 +133,12 @@ class SyntheticDepthDataModule(BodyDataModule):
         """The source's licence; see `BodyDataModule`."""
         return self.source.licence
 
+    def examples(self, num_samples: int) -> tuple[Batch, Tensor]:
+        """See `BodyDataModule`."""
+        return self._make_train_synthesizer(num_samples).examples(
+            [(0, index) for index in range(num_samples)]
+        )
+
     def describe(self) -> dict[str, Any]:
         """See `BodyDataModule`."""
         return {
@@ -154,14 +160,15 @@ class SyntheticDepthDataModule(BodyDataModule):
     def setup(self, stage: str) -> None:
         """Build the sets that a stage (`fit`, `validate` or `test`) needs."""
         if stage == "fit" and self._train is None:
-            records = self.source.records("train", self.sizes["train"], self.pool_seed)
-            self._train = DepthSynthesizer(
-                records, self.body, self.settings, (self.seed, SPLITS.index("train"))
-            )
+            self._train = self._make_train_synthesizer(self.sizes["train"])
         needed = {"fit": ["val"], "validate": ["val"], "test": ["test"]}[stage]
         for split in needed:
             if split not in self._fixed:
                 self._fixed[split] = FixedSamples(self._fixed_samples(split))
+
+    def _make_train_synthesizer(self, num_records: int) -> DepthSynthesizer:
+        records = self.source.records("train", num_records, self.pool_seed)
+        return DepthSynthesizer(records, self.body, self.settings, (self.seed, SPLITS.index("train")))
 
     def train_dataloader(self) -> DataLoader:
         """Samples rendered as they are needed; the last, incomplete batch is dropped."""

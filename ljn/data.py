@@ -56,5 +56,9 @@ class BodyDataModule(LightningDataModule):
         """Where the data comes from and what may be done with it: goes into checkpoints."""
 
     @abstractmethod
+    def examples(self, num_samples: int) -> tuple[Batch, Tensor]:
+        """The first training samples, and the depth images `(B, H, W)`, metres, that they were taken from."""
+
+    @abstractmethod
     def describe(self) -> dict[str, Any]:
         """Source, fingerprint, sizes and the like: goes into records."""

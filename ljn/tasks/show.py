@@ -1,0 +1,39 @@
+"""`task=show`: look at the data before training on it."""
+
+import logging
+from pathlib import Path
+
+from omegaconf import DictConfig
+
+from ljn.data import BodyDataModule
+from ljn.drawing import draw_examples
+from ljn.tasks.building import build
+from ljn.tasks.train import prepare_process
+from ljn.tasks.validation import validate
+
+_LOG = logging.getLogger(__name__)
+
+
+def show(cfg: DictConfig) -> dict[str, float]:
+    """Draw the first training samples of the configured data on a page, `output_dir/show.png`.
+
+    Args:
+        cfg: The composed configuration; `task.num_samples` says how many.
+
+    Returns:
+        The mean error of their initial joints, mm, as `show/initial_mpjpe`.
+
+    Raises:
+        ValueError: The configuration or the data it names is wrong.
+        FileNotFoundError: A file that it names is missing.
+    """
+    validate(cfg)
+    prepare_process(cfg)
+    datamodule: BodyDataModule = build(cfg.data)
+    datamodule.prepare_data()
+    batch, depth = datamodule.examples(cfg.task.num_samples)
+    path = Path(cfg.paths.output_dir) / "show.png"
+    draw_examples(batch, depth).savefig(path)
+    _LOG.info("%d samples: %s", len(depth), path)
+    error = (batch["initial_joints"] - batch["joints"]).norm(dim=-1).mean()
+    return {"show/initial_mpjpe": 1000 * float(error)}
