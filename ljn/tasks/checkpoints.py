@@ -21,7 +21,8 @@ _READ_ERRORS = (
     AttributeError, EOFError, LookupError, OSError, RuntimeError, TypeError, ValueError, pickle.UnpicklingError,
     zipfile.BadZipFile,
 )  # fmt: skip
-_CONFIG_GROUPS = ("preset", "model", "module", "data", "body", "trainer", "seed", "name")
+CONFIG_GROUPS = ("preset", "model", "module", "data", "body", "trainer", "seed", "name")
+"""The part of a stored configuration that decides what a checkpoint is."""
 
 
 class Provenance(Callback):
@@ -143,7 +144,7 @@ def _is_ours(content: Any, provenance: Any) -> bool:
     return (
         isinstance(provenance, dict)
         and all(isinstance(provenance.get(name), kind) for name, kind in types.items())
-        and all(group in provenance["config"] for group in _CONFIG_GROUPS)
+        and all(group in provenance["config"] for group in CONFIG_GROUPS)
         # A stored configuration is resolved. An interpolation would be resolved here, on this machine's values.
         and not _has_interpolation(provenance["config"])
         and isinstance(content.get("state_dict"), dict)

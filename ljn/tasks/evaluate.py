@@ -11,7 +11,7 @@ from omegaconf import DictConfig, OmegaConf
 from ljn.data import BodyDataModule
 from ljn.tasks import records
 from ljn.tasks.building import build, check_targets
-from ljn.tasks.checkpoints import Checkpoint, load_state, read_checkpoint
+from ljn.tasks.checkpoints import CONFIG_GROUPS, Checkpoint, load_state, read_checkpoint
 from ljn.tasks.tracking import tracking
 from ljn.tasks.train import (
     build_trainer,
@@ -24,9 +24,9 @@ from ljn.tasks.validation import validate
 
 _LOG = logging.getLogger(__name__)
 
-# Whose values a checkpoint decides, and whose this call does.
-_FROM_CHECKPOINT = ("preset", "model", "module", "data", "body", "trainer", "seed", "name")
+# Of `CONFIG_GROUPS`, which the checkpoint decides: those whose single values a call may change.
 _OVERRIDABLE = ("data", "trainer", "body")
+# What the checkpoint has no say in.
 _FROM_CALL = (
     "task",
     "callbacks",
@@ -110,14 +110,14 @@ def with_checkpoint_config(cfg: DictConfig, checkpoint: Checkpoint, overrides: l
     Raises:
         ValueError: An override is about something that the checkpoint decides.
     """
-    check_targets({name: checkpoint.config.get(name) for name in _FROM_CHECKPOINT}, "the checkpoint's config")
+    check_targets({name: checkpoint.config.get(name) for name in CONFIG_GROUPS}, "the checkpoint's config")
     plain: dict[str, Any] = OmegaConf.to_container(cfg, resolve=False)  # type: ignore[assignment]
     # What belongs to the machine rather than to the numbers stays this call's.
     of_machine = {
         "data": {name: plain["data"][name] for name in ("cache_dir", "num_workers", "prefetch_batches")},
         "trainer": {"accelerator": plain["trainer"]["accelerator"]},
     }
-    plain |= {name: checkpoint.config[name] for name in _FROM_CHECKPOINT}
+    plain |= {name: checkpoint.config[name] for name in CONFIG_GROUPS}
     plain |= {name: {**plain[name], **values} for name, values in of_machine.items()}
     merged = OmegaConf.create(plain)
     OmegaConf.set_struct(merged, True)
@@ -131,7 +131,7 @@ def with_checkpoint_config(cfg: DictConfig, checkpoint: Checkpoint, overrides: l
             raise ValueError(
                 f"{override.input_line}: model, data and sizes come from the checkpoint; an evaluation can "
                 f"change single values of {', '.join(_OVERRIDABLE)} (data.keypoint_noise_px=15) and choose "
-                f"{', '.join(_FROM_CALL[1:4])}"
+                "callbacks, logger and paths"
             )
         _set(merged, key, override.value(), override.input_line)
     return merged

@@ -25,7 +25,7 @@ RECORD_VERSION = 1
 
 # What may differ between two runs that are the same run; what data files hold is in the data's fingerprint.
 _NOT_IDENTITY: dict[str, tuple[str, ...]] = {
-    "data": ("cache_dir", "num_workers", "prefetch_batches", "body_path", "body_gender"),
+    "data": ("source", "cache_dir", "num_workers", "prefetch_batches", "body_path", "body_gender"),
     "trainer": ("accelerator", "devices", "enable_model_summary", "log_every_n_steps", "profiler"),
 }
 
@@ -42,7 +42,6 @@ def identity(cfg: DictConfig, data_fingerprint: str) -> dict[str, Any]:
     for group in ("data", "model", "module", "trainer"):
         dropped = _NOT_IDENTITY.get(group, ())
         kept[group] = {key: value for key, value in plain[group].items() if key not in dropped}
-    kept["data"].pop("source", None)
     return kept
 
 

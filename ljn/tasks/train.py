@@ -74,7 +74,7 @@ def train(cfg: DictConfig) -> dict[str, float]:
         config = save_config(cfg, run_dir)
         trainer = build_trainer(cfg, run_dir, config, datamodule)
         record.add(device=str(trainer.strategy.root_device), num_threads=torch.get_num_threads())
-        _LOG.info("resuming from %s" if resumes else "training in %s", last if resumes else run_dir)
+        _LOG.info(f"resuming from {last}" if resumes else f"training in {run_dir}")
         # The fixed sets first: what is wrong with them should not come up after the training.
         datamodule.setup("fit")
         datamodule.setup("test")
