@@ -1,4 +1,4 @@
-"""Operations on sets of points: distance matrices, gathering and ball grouping."""
+"""Operations on sets of points: distance matrices, gathering, farthest point sampling and ball grouping."""
 
 import torch
 from torch import Tensor
@@ -65,6 +65,11 @@ def ball_group(points: Tensor, centres: Tensor, radii: Tensor, group_size: int) 
     Returns:
         `(B, M, group_size)`, int64 indices into the N points.
     """
+    form = _ball_group_on_cpu if points.is_cpu else _ball_group_as_tensors
+    return form(points, centres, radii, group_size)
+
+
+def _ball_group_as_tensors(points: Tensor, centres: Tensor, radii: Tensor, group_size: int) -> Tensor:
     num_points = points.shape[1]
     squared = squared_distances(centres, points)  # (B, M, N)
     inside = squared <= radii.square()[:, None]
@@ -80,7 +85,71 @@ def ball_group(points: Tensor, centres: Tensor, radii: Tensor, group_size: int) 
 
     is_empty = count[..., 0] == 0
     if is_empty.any():
-        nearest = squared[is_empty].topk(min(group_size, num_points), largest=False).indices
-        repeat = torch.arange(group_size, device=points.device) % nearest.shape[-1]
-        group[is_empty] = nearest[:, repeat]
+        group[is_empty] = _nearest(squared[is_empty], group_size)
     return group
+
+
+def _nearest(squared: Tensor, group_size: int) -> Tensor:
+    """Indices `(E, group_size)` of the smallest of `squared` `(E, N)`, repeated where N is smaller."""
+    nearest = squared.topk(min(group_size, squared.shape[-1]), largest=False).indices
+    return nearest[:, torch.arange(group_size, device=squared.device) % nearest.shape[-1]]
+
+
+def _ball_group_on_cpu(points: Tensor, centres: Tensor, radii: Tensor, group_size: int) -> Tensor:
+    from ljn.geometry import kernels  # numba takes its time to import
+
+    group = torch.empty(*centres.shape[:2], group_size, dtype=torch.int64)
+    columns = (points.detach(), centres.detach().to(points), radii.detach().to(points).square())
+    kernels.ball_group(*(column.contiguous().numpy() for column in columns), group.numpy())
+    is_empty = group[..., 0] < 0
+    if is_empty.any():
+        sample, centre = is_empty.nonzero(as_tuple=True)
+        squared = squared_distances(centres[sample, centre][:, None], points[sample])[:, 0]
+        group[is_empty] = _nearest(squared, group_size)
+    return group
+
+
+@torch.no_grad()
+def farthest_point_sampling(points: Tensor, num_samples: int) -> Tensor:
+    """Indices of points that are spread over the cloud: each is the farthest from those before it.
+
+    The first is the point farthest from the cloud's mean, not a random one: the sample is the same in every
+    run and, but for ties, whatever the order of the points.
+
+    Args:
+        points: `(B, N, 3)`, metres.
+        num_samples: Number of points to take; beyond the number of distinct points, points repeat.
+
+    Returns:
+        `(B, num_samples)`, int64 indices into the N points.
+
+    Raises:
+        ValueError: `num_samples` exceeds N.
+    """
+    if not 1 <= num_samples <= points.shape[1]:
+        raise ValueError(
+            f"num_samples: expected 1 to {points.shape[1]}, the number of points, got {num_samples}"
+        )
+    # In float64: the mean's rounding, and with it the first point, does not hang on the points' order.
+    centres = points.double().mean(1).to(points)
+    form = _farthest_points_on_cpu if points.is_cpu else _farthest_points_as_tensors
+    return form(points, centres, num_samples)
+
+
+def _farthest_points_on_cpu(points: Tensor, centres: Tensor, num_samples: int) -> Tensor:
+    from ljn.geometry import kernels
+
+    index = torch.empty(len(points), num_samples, dtype=torch.int64)
+    kernels.farthest_points(points.detach().contiguous().numpy(), centres.numpy(), index.numpy())
+    return index
+
+
+def _farthest_points_as_tensors(points: Tensor, centres: Tensor, num_samples: int) -> Tensor:
+    index = torch.empty(len(points), num_samples, dtype=torch.int64, device=points.device)
+    index[:, 0] = squared_distances(centres[:, None], points)[:, 0].argmax(-1)
+    distance = torch.full(points.shape[:2], torch.inf, dtype=points.dtype, device=points.device)
+    for number in range(1, num_samples):
+        last = gather_points(points, index[:, number - 1 : number])  # (B, 1, 3)
+        distance = torch.minimum(distance, squared_distances(last, points)[:, 0])
+        index[:, number] = distance.argmax(-1)
+    return index

@@ -2,7 +2,15 @@ import numpy as np
 import pytest
 import torch
 
-from ljn.geometry.points import ball_group, distance_matrix, gather_points, squared_distances
+from ljn.geometry.points import (
+    _ball_group_as_tensors,
+    _farthest_points_as_tensors,
+    ball_group,
+    distance_matrix,
+    farthest_point_sampling,
+    gather_points,
+    squared_distances,
+)
 
 
 def draw(*shape, dtype=torch.float64, seed=0):
@@ -159,6 +167,15 @@ def test_ball_group_equals_a_loop_in_every_case_at_once(dtype, group_size):
     np.testing.assert_array_equal(index.numpy(), naive_ball_group(points, centres, radii, group_size))
 
 
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_the_compiled_and_the_tensor_form_of_ball_group_agree(dtype):
+    points, centres = draw(3, 400, 3, dtype=dtype), draw(3, 40, 3, dtype=dtype, seed=1)
+    centres[:, ::7] += 20  # empty
+    radii = torch.linspace(0.1, 3.0, 40, dtype=dtype)
+    expected = _ball_group_as_tensors(points, centres, radii, 24)
+    assert torch.equal(ball_group(points, centres, radii, 24), expected)
+
+
 def test_ball_group_is_deterministic():
     points, centres, radii = draw(2, 200, 3), draw(2, 9, 3, seed=1), torch.full((9,), 0.7)
     first = ball_group(points, centres, radii, 16)
@@ -190,3 +207,49 @@ def test_ball_group_takes_inputs_that_need_gradients():
     assert torch.equal(
         index, ball_group(points.detach(), points[:, :2].detach(), torch.tensor([0.5, 0.5]), 4)
     )
+
+
+# Farthest point sampling
+
+
+def naive_farthest_points(cloud, num_samples):
+    chosen = [int(((cloud - cloud.mean(0)) ** 2).sum(-1).argmax())]
+    while len(chosen) < num_samples:
+        to_chosen = ((cloud[:, None] - cloud[chosen]) ** 2).sum(-1).min(1)
+        chosen.append(int(to_chosen.argmax()))
+    return chosen
+
+
+@pytest.mark.parametrize("num_samples", [1, 2, 17, 40])
+def test_farthest_point_sampling_equals_a_loop(num_samples):
+    points = draw(3, 40, 3)
+    index = farthest_point_sampling(points, num_samples)
+    assert index.dtype == torch.int64
+    assert index.tolist() == [naive_farthest_points(cloud, num_samples) for cloud in points.numpy()]
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_the_compiled_and_the_tensor_form_of_farthest_point_sampling_agree(dtype):
+    points = draw(2, 500, 3, dtype=dtype)
+    points[:, 300:] = points[:, :200]  # repeated points
+    expected = _farthest_points_as_tensors(points, points.double().mean(1).to(points), 250)
+    assert torch.equal(farthest_point_sampling(points, 250), expected)
+
+
+def test_farthest_point_sampling_takes_the_same_points_whatever_their_order():
+    points = draw(1, 200, 3)
+    order = torch.randperm(200, generator=torch.Generator().manual_seed(3))
+    straight = gather_points(points, farthest_point_sampling(points, 50))
+    shuffled = gather_points(points[:, order], farthest_point_sampling(points[:, order], 50))
+    assert torch.equal(straight, shuffled)
+
+
+def test_farthest_point_sampling_takes_no_point_twice_while_there_are_others():
+    index = farthest_point_sampling(draw(2, 60, 3), 60)
+    assert all(len(set(row)) == 60 for row in index.tolist())
+
+
+@pytest.mark.parametrize("num_samples", [0, 41])
+def test_a_sample_larger_than_the_cloud_is_refused(num_samples):
+    with pytest.raises(ValueError, match=f"num_samples: expected 1 to 40.*got {num_samples}"):
+        farthest_point_sampling(draw(1, 40, 3), num_samples)
