@@ -15,8 +15,8 @@ def import_open3d() -> Any:
     except (ImportError, OSError) as error:
         raise ImportError(
             f"Open3D cannot be loaded ({error}). Install it with `pip install -e '.[open3d]'` and the system "
-            "libraries libusb-1.0-0, libegl1 and libgl1; or do without it: data.normals=window and "
-            "data.renderer=zbuffer"
+            "libraries libusb-1.0-0, libegl1 and libgl1; or do without it: "
+            "data.normals=knn (the same normals) or window, data.renderer=zbuffer"
         ) from error
     return open3d
 

@@ -8,14 +8,14 @@ from torch import Tensor
 
 from ljn.geometry.camera import Camera
 from ljn.optional import import_pyrender
-from ljn.render import check_vertices
+from ljn.render import Renderer, check_vertices
 
 # pyrender's axes are OpenGL's: y up, looking along -z.
 _GL_FROM_CAMERA = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
-class PyRender:
-    """The `pyrender` backend of `ljn.render.Renderer`.
+class PyRender(Renderer):
+    """The `pyrender` backend of `ljn.render.Renderer`; depth alone, returned on the CPU.
 
     The GL context is made on first use, in the process that uses it: a context that is older than a fork
     deadlocks in the child. One renderer a process; data workers that use it must be spawned.

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ljn.geometry.camera import Camera
-from ljn.render import check_vertices
+from ljn.render import Fragments, Renderer, check_vertices
 
 
 @numba.njit(cache=True, nogil=True)
@@ -20,8 +20,11 @@ def _rasterise(
     cx: float,
     cy: float,
     depth: np.ndarray,
+    face_ids: np.ndarray | None,
 ) -> None:
-    """Write planar depth into `depth` `(H, W)`, which must be zero.
+    """Write planar depth into `depth` `(H, W)`, which must be zero, and what is seen into `face_ids` `(H, W)`.
+
+    `face_ids` may be None: numba then compiles a version without it.
 
     Inverse depth is affine in the image, so it is interpolated with the edge functions and the largest wins.
     Each edge function is computed from its two end points alone: neighbours get it with the opposite sign to
@@ -70,20 +73,73 @@ def _rasterise(
                 w = (ea * wa + eb * wb + ec * wc) / total
                 if w > buffer[v, u]:
                     buffer[v, u] = w
+                    if face_ids is not None:
+                        face_ids[v, u] = f
     for v in range(top, bottom + 1):
         for u in range(left, right + 1):
             if buffer[v, u] > 0.0:
                 depth[v, u] = 1.0 / buffer[v, u]
 
 
-class ZBuffer:
-    """The `zbuffer` backend of `ljn.render.Renderer`; computes in float64, on the CPU."""
+@numba.njit(cache=True, nogil=True)
+def _write_barycentrics(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    fx: float,
+    fy: float,
+    cx: float,
+    cy: float,
+    face_ids: np.ndarray,
+    barycentrics: np.ndarray,
+) -> None:
+    """Write the corners' weights into `barycentrics` `(H, W, 3)` wherever `face_ids` `(H, W)` is not -1."""
+    height, width = face_ids.shape
+    us, vs, inverse = np.empty(3), np.empty(3), np.empty(3)
+    weights = np.empty(3)
+    for v in range(height):
+        for u in range(width):
+            if face_ids[v, u] < 0:
+                continue
+            for k in range(3):
+                x, y, z = vertices[faces[face_ids[v, u], k]]
+                inverse[k] = 1.0 / z
+                us[k] = x * inverse[k] * fx + cx
+                vs[k] = y * inverse[k] * fy + cy
+            for k in range(3):
+                i, j = (k + 1) % 3, (k + 2) % 3
+                edge = (us[i] - u) * (vs[j] - v) - (us[j] - u) * (vs[i] - v)
+                weights[k] = edge * inverse[k]
+            total = weights.sum()
+            for k in range(3):
+                barycentrics[v, u, k] = weights[k] / total
+
+
+class ZBuffer(Renderer):
+    """The `zbuffer` backend of `ljn.render.Renderer`; computes in float64, on the CPU, and returns there."""
 
     def __call__(self, vertices: Tensor, faces: Tensor, camera: Camera) -> Tensor:
         """See `ljn.render.Renderer`."""
-        check_vertices(vertices)
-        depth = np.zeros((len(vertices), camera.height, camera.width), np.float32)
-        face_array = np.ascontiguousarray(faces.cpu().numpy(), dtype=np.int64)
-        for mesh, image in zip(vertices.detach().cpu().double().numpy(), depth):
-            _rasterise(mesh, face_array, camera.fx, camera.fy, camera.cx, camera.cy, image)
+        meshes, face_array = _as_arrays(vertices, faces)
+        depth = np.zeros((len(meshes), camera.height, camera.width), np.float32)
+        for mesh, image in zip(meshes, depth):
+            _rasterise(mesh, face_array, camera.fx, camera.fy, camera.cx, camera.cy, image, None)
         return torch.from_numpy(depth)
+
+    def fragments(self, vertices: Tensor, faces: Tensor, camera: Camera) -> Fragments:
+        """See `ljn.render.Renderer`; of faces that are equally near, the first is seen."""
+        meshes, face_array = _as_arrays(vertices, faces)
+        size = (len(meshes), camera.height, camera.width)
+        depth, face_ids = np.zeros(size, np.float32), np.full(size, -1)
+        barycentrics = np.zeros((*size, 3), np.float32)
+        intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy)
+        for mesh, image, ids, weights in zip(meshes, depth, face_ids, barycentrics):
+            _rasterise(mesh, face_array, *intrinsics, image, ids)
+            _write_barycentrics(mesh, face_array, *intrinsics, ids, weights)
+        return Fragments(*map(torch.from_numpy, (depth, face_ids, barycentrics)))
+
+
+def _as_arrays(vertices: Tensor, faces: Tensor) -> tuple[np.ndarray, np.ndarray]:
+    """The meshes `(B, V, 3)` in float64 and the faces `(F, 3)` in int64, for numba."""
+    check_vertices(vertices)
+    meshes = np.ascontiguousarray(vertices.detach().cpu().double().numpy())
+    return meshes, np.ascontiguousarray(faces.cpu().numpy(), dtype=np.int64)

@@ -1,12 +1,12 @@
 import numpy as np
 import pytest
-import torch
 
-from datamodules.placement import place
-from ljn.cloud.normals import _smallest_eigenvector, get_normal_estimator, open3d_normals, window_normals
-from ljn.cloud.sampling import Cloud, add_depth_noise, sample_cloud
+from ljn.cloud.normals import NORMALS, get_normal_estimator
+from ljn.cloud.normals.eigenvector import smallest_eigenvector as scalar_smallest_eigenvector
+from ljn.cloud.normals.neighbours import knn_normals, open3d_normals
+from ljn.cloud.normals.window import window_normals
+from ljn.cloud.sampling import Cloud
 from ljn.geometry.camera import Camera
-from ljn.render import get_renderer
 
 CAMERA = Camera(fx=180.0, fy=184.0, cx=50.3, cy=41.8, width=100, height=80)
 
@@ -64,18 +64,9 @@ def test_a_sphere_has_normals_along_its_radius():
     assert np.median(error) < 0.4
 
 
-def noisy_body(bodies, kinect, number, num_points=2048):
-    rng = np.random.default_rng(number)
-    mesh = bodies[0][number]
-    vertices = mesh + place(mesh, kinect, rng.random(3))
-    depth = get_renderer()(torch.from_numpy(vertices)[None], bodies[1], kinect)[0].numpy()
-    noisy = add_depth_noise(depth, 0.001, rng)
-    return sample_cloud(noisy, kinect, num_points, rng), noisy
-
-
 @pytest.mark.parametrize("number", range(3))
-def test_normals_of_a_body_have_unit_length_and_look_towards_the_camera(bodies, kinect, number):
-    cloud, noisy = noisy_body(bodies, kinect, number)
+def test_normals_of_a_body_have_unit_length_and_look_towards_the_camera(noisy_body, kinect, number):
+    cloud, noisy = noisy_body(number)
     normals = window_normals(cloud, noisy, kinect)
     assert np.isfinite(normals).all()
     np.testing.assert_allclose(np.linalg.norm(normals, axis=-1), 1, atol=1e-6)
@@ -139,8 +130,8 @@ def test_the_background_does_not_take_part():
     assert degrees_between(window_normals(cloud_of(depth), depth, CAMERA), normal[None]).max() < 0.05
 
 
-def test_normals_equal_the_direct_fit_of_a_plane(bodies, kinect):
-    cloud, noisy = noisy_body(bodies, kinect, 0, num_points=100)
+def test_normals_equal_the_direct_fit_of_a_plane(noisy_body, kinect):
+    cloud, noisy = noisy_body(0, num_points=100)
     normals = window_normals(cloud, noisy, kinect)
     lifted = rays(kinect) * noisy[..., None].astype(np.float64)
     for (u, v), normal in zip(cloud.pixels, normals):
@@ -157,7 +148,7 @@ def test_normals_equal_the_direct_fit_of_a_plane(bodies, kinect):
 
 
 def smallest_eigenvector(matrix):
-    return np.array(_smallest_eigenvector(*matrix[np.triu_indices(3)]))
+    return np.array(scalar_smallest_eigenvector(*matrix[np.triu_indices(3)]))
 
 
 @pytest.mark.parametrize("scale", [1e-9, 1.0, 1e6])
@@ -195,15 +186,17 @@ def test_there_is_no_smallest_eigenvector_where_two_are_equal():
 
 
 def test_an_unknown_estimator_is_an_error_that_names_the_known_ones():
-    with pytest.raises(ValueError, match="normals: expected 'window' or 'open3d', got 'pca'"):
+    with pytest.raises(ValueError, match="normals: expected one of window, knn, open3d, got 'pca'"):
         get_normal_estimator("pca")
+    assert NORMALS == ("window", "knn", "open3d")
     assert get_normal_estimator("window") is window_normals
+    assert get_normal_estimator("knn") is knn_normals
 
 
 @pytest.mark.render
-def test_open3ds_normals_are_planes_through_the_30_nearest_points(bodies, kinect, open3d):
+def test_open3ds_normals_are_planes_through_the_30_nearest_points(noisy_body, kinect, open3d):
     spatial = pytest.importorskip("scipy.spatial", reason="SciPy is not installed")
-    cloud, noisy = noisy_body(bodies, kinect, 1)
+    cloud, noisy = noisy_body(1)
     normals = get_normal_estimator("open3d")(cloud, noisy, kinect)
     assert normals.dtype == np.float32
 
@@ -219,15 +212,15 @@ def test_open3ds_normals_are_planes_through_the_30_nearest_points(bodies, kinect
 
 
 @pytest.mark.render
-def test_open3ds_normals_have_unit_length_and_look_towards_the_camera(bodies, kinect, open3d):
-    cloud, noisy = noisy_body(bodies, kinect, 2)
+def test_open3ds_normals_have_unit_length_and_look_towards_the_camera(noisy_body, kinect, open3d):
+    cloud, noisy = noisy_body(2)
     normals = open3d_normals(cloud, noisy, kinect)
     np.testing.assert_allclose(np.linalg.norm(normals, axis=-1), 1, atol=1e-6)
     assert (normals * unit(cloud.points)).sum(-1).max() < 1e-6
 
 
 @pytest.mark.render
-def test_window_and_open3d_normals_agree_on_most_of_a_body(bodies, kinect, open3d):
-    cloud, noisy = noisy_body(bodies, kinect, 0, num_points=4096)
+def test_window_and_open3d_normals_agree_on_most_of_a_body(noisy_body, kinect, open3d):
+    cloud, noisy = noisy_body(0, num_points=4096)
     difference = degrees_between(window_normals(cloud, noisy, kinect), open3d_normals(cloud, noisy, kinect))
     assert np.median(difference) < 10

@@ -1,21 +1,32 @@
-import subprocess
-import sys
+"""Rules that every rasteriser keeps, in float64."""
 
 import numpy as np
 import pytest
 import torch
 
 from ljn.geometry.camera import Camera
-from ljn.render import RENDERERS, get_renderer
+from ljn.render import get_renderer
+from ljn.render.rasterizer import TorchRasterizer
 
 SMALL = Camera(fx=20.0, fy=22.0, cx=11.3, cy=8.6, width=24, height=18)
 # Pixel centres are exactly representable: (x, y, 1) falls on pixel (16 x + 8, 16 y + 8).
 EXACT = Camera(fx=16.0, fy=16.0, cx=8.0, cy=8.0, width=17, height=17)
 
 
-def render(vertices, faces, camera):
-    vertices, faces = torch.as_tensor(vertices), torch.as_tensor(np.asarray(faces))
-    return get_renderer("zbuffer")(vertices[None], faces, camera)[0].numpy()
+@pytest.fixture(params=["zbuffer", "torch"])
+def renderer(request):
+    return get_renderer(request.param)
+
+
+@pytest.fixture
+def render(renderer):
+    """Draws one mesh, given as arrays: its depth image `(H, W)`."""
+
+    def draw(vertices, faces, camera):
+        vertices, faces = torch.as_tensor(vertices), torch.as_tensor(np.asarray(faces))
+        return renderer(vertices[None], faces, camera)[0].numpy()
+
+    return draw
 
 
 def pixel_rays(camera):
@@ -84,7 +95,7 @@ def grid_faces(columns, rows):
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_depth_equals_rays_against_triangles_of_either_side(seed):
+def test_depth_equals_rays_against_triangles_of_either_side(render, seed):
     rng = np.random.default_rng(seed)
     vertices = rng.uniform((-0.8, -0.6, 0.9), (0.8, 0.6, 3.0), (12, 3))
     faces = np.stack([rng.choice(12, 3, replace=False) for _ in range(8)])
@@ -97,7 +108,7 @@ def test_depth_equals_rays_against_triangles_of_either_side(seed):
 
 
 @pytest.mark.parametrize("subdivisions", [0, 2, 3])
-def test_a_closed_surface_has_no_holes(subdivisions):
+def test_a_closed_surface_has_no_holes(render, subdivisions):
     camera = Camera(fx=150.0, fy=150.0, cx=63.7, cy=64.2, width=128, height=128)
     vertices, faces = icosphere(subdivisions, 0.6, (0.05, -0.03, 2.0))
     assert len(vertices) == 10 * 4**subdivisions + 2
@@ -108,7 +119,7 @@ def test_a_closed_surface_has_no_holes(subdivisions):
     np.testing.assert_allclose(depth, expected, rtol=1e-6)
 
 
-def test_edges_and_corners_exactly_through_pixel_centres_leave_no_gap():
+def test_edges_and_corners_exactly_through_pixel_centres_leave_no_gap(render):
     x, y = np.meshgrid(np.arange(2, 13) / 16 - 0.5, np.arange(3, 12) / 16 - 0.5)
     vertices = np.stack([x, y, np.ones(x.shape)], -1).reshape(-1, 3)
     depth = render(vertices, grid_faces(11, 9), EXACT)
@@ -118,7 +129,7 @@ def test_edges_and_corners_exactly_through_pixel_centres_leave_no_gap():
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_edges_within_rounding_of_pixel_centres_leave_no_gap(seed):
+def test_edges_within_rounding_of_pixel_centres_leave_no_gap(render, seed):
     rng = np.random.default_rng(seed)
     x, y = np.meshgrid(np.arange(1, 16) / 16 - 0.5, np.arange(1, 16) / 16 - 0.5)
     z = rng.uniform(1.0, 1.2, x.shape)
@@ -127,7 +138,7 @@ def test_edges_within_rounding_of_pixel_centres_leave_no_gap(seed):
     np.testing.assert_allclose(depth[2:15, 2:15], z[1:-1, 1:-1], rtol=1e-6)
 
 
-def test_a_fan_of_triangles_around_a_pixel_centre_covers_it():
+def test_a_fan_of_triangles_around_a_pixel_centre_covers_it(render):
     rng = np.random.default_rng(0)
     for _ in range(50):
         angles = np.sort(rng.uniform(0, 2 * np.pi, 7))
@@ -139,7 +150,7 @@ def test_a_fan_of_triangles_around_a_pixel_centre_covers_it():
         assert render(vertices, faces, EXACT)[8, 8] == 1.0
 
 
-def test_triangles_thinner_than_rounding_are_no_error():
+def test_triangles_thinner_than_rounding_are_no_error(render):
     rng = np.random.default_rng(0)
     camera = Camera(fx=1.0, fy=1.0, cx=0.0, cy=0.0, width=6, height=6)
     u = rng.uniform(0, 4, (20_000, 3))
@@ -149,20 +160,22 @@ def test_triangles_thinner_than_rounding_are_no_error():
     assert set(np.unique(depth)) <= {0.0, 1.0}
 
 
-def test_a_triangle_without_area_draws_nothing():
+def test_a_triangle_without_area_draws_nothing(render):
     vertices = np.array([[-0.3, -0.3, 1.0], [0.3, 0.3, 1.0], [0.0, 0.0, 1.0]])
     assert not render(vertices, [(0, 1, 2), (0, 1, 1), (2, 2, 2)], EXACT).any()
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_depth_of_a_plane_across_the_axis_is_exact(dtype):
+def test_depth_of_a_plane_across_the_axis_is_exact(renderer, render, dtype):
     z = 1.7
     vertices = torch.tensor([[-9, -9, z], [9, -9, z], [9, 9, z], [-9, 9, z]], dtype=dtype)
     depth = render(vertices, [(0, 1, 2), (0, 2, 3)], SMALL)
-    assert (depth == np.float32(z)).all()
+    # In float32 the depth's reciprocal is rounded, and weighted means of it are.
+    is_rounded = isinstance(renderer, TorchRasterizer) and dtype == torch.float32
+    np.testing.assert_allclose(depth, np.float32(z), rtol=5e-7 if is_rounded else 0)
 
 
-def test_depth_is_planar_depth_on_a_tilted_plane():
+def test_depth_is_planar_depth_on_a_tilted_plane(render):
     # z = 2 + x / 2 on every ray.
     corners = [(x, y, 2 + x / 2) for x, y in ((-2, -2), (2, -2), (2, 2), (-2, 2))]
     slope = pixel_rays(SMALL)[..., 0]
@@ -170,7 +183,7 @@ def test_depth_is_planar_depth_on_a_tilted_plane():
     np.testing.assert_allclose(depth, 2 / (1 - slope / 2), rtol=1e-6)
 
 
-def test_the_nearer_surface_hides_the_farther_in_either_order():
+def test_the_nearer_surface_hides_the_farther_in_either_order(render):
     far = np.array([[-9, -9, 3.0], [9, -9, 3.0], [0, 9, 3.0]])
     near = far * (1, 1, 0.5)
     for first, second in ((near, far), (far, near)):
@@ -178,7 +191,7 @@ def test_the_nearer_surface_hides_the_farther_in_either_order():
         assert depth[8, 11] == 1.5
 
 
-def test_a_triangle_partly_outside_the_image_is_clipped():
+def test_a_triangle_partly_outside_the_image_is_clipped(render):
     vertices = np.array([[-3.0, 0.1, 1.4], [0.2, -2.5, 1.8], [2.5, 1.9, 2.2]])
     expected = naive_depth(vertices, [(0, 1, 2)], SMALL)
     depth = render(vertices, [(0, 1, 2)], SMALL)
@@ -187,44 +200,43 @@ def test_a_triangle_partly_outside_the_image_is_clipped():
     np.testing.assert_allclose(depth, expected, rtol=1e-6)
 
 
-def test_a_mesh_outside_the_image_draws_nothing():
+def test_a_mesh_outside_the_image_draws_nothing(render):
     vertices = np.array([[5.0, 0, 1], [6.0, 0, 1], [5.0, 1, 1]])
     assert not render(vertices, [(0, 1, 2)], SMALL).any()
     assert not render(vertices * (-1, 1, 1), [(0, 1, 2)], SMALL).any()
 
 
-def test_a_batch_equals_its_meshes_rendered_alone(bodies, kinect):
+def test_a_batch_equals_its_meshes_rendered_alone(renderer, bodies, kinect):
     vertices, faces = torch.from_numpy(bodies[0][:3]) + torch.tensor([0.0, 0.0, 2.5]), bodies[1]
-    renderer = get_renderer("zbuffer")
     together = renderer(vertices, faces, kinect)
     assert together.shape == (3, kinect.height, kinect.width)
     for mesh, depth in zip(vertices, together):
         assert torch.equal(renderer(mesh[None], faces, kinect)[0], depth)
 
 
-def test_an_empty_batch_gives_an_empty_batch(bodies, kinect):
-    depth = get_renderer("zbuffer")(torch.zeros(0, 6890, 3), bodies[1], kinect)
+def test_an_empty_batch_gives_an_empty_batch(renderer, bodies, kinect):
+    depth = renderer(torch.zeros(0, 6890, 3), bodies[1], kinect)
     assert depth.shape == (0, kinect.height, kinect.width)
 
 
-def test_another_camera_gives_another_image_of_its_own_size(bodies, kinect):
+def test_another_camera_gives_another_image_of_its_own_size(renderer, bodies, kinect):
     vertices, faces = torch.from_numpy(bodies[0][:1]) + torch.tensor([0.0, 0.0, 3.0]), bodies[1]
     half = Camera(kinect.fx / 2, kinect.fy / 2, kinect.cx / 2, kinect.cy / 2, 212, 256)
-    large = get_renderer("zbuffer")(vertices, faces, kinect)
-    small = get_renderer("zbuffer")(vertices, faces, half)
+    large = renderer(vertices, faces, kinect)
+    small = renderer(vertices, faces, half)
     assert small.shape == (1, 256, 212)
     # Pixel (u, v) of the small image has the ray of (2u, 2v) of the large one.
     assert torch.equal(small > 0, large[:, ::2, ::2] > 0)
     torch.testing.assert_close(small, large[:, ::2, ::2])
 
 
-def test_meshes_that_need_gradients_can_be_drawn():
+def test_meshes_that_need_gradients_can_be_drawn(renderer):
     vertices = torch.tensor([[[-9.0, -9, 2], [9, -9, 2], [0, 9, 2]]], requires_grad=True)
-    assert get_renderer()(vertices, torch.tensor([[0, 1, 2]]), SMALL).max() == 2
+    assert renderer(vertices, torch.tensor([[0, 1, 2]]), SMALL).max() == 2
 
 
 @pytest.mark.parametrize("z", [0.0, -1.0])
-def test_a_vertex_not_in_front_of_the_camera_is_an_error(z):
+def test_a_vertex_not_in_front_of_the_camera_is_an_error(render, z):
     vertices = np.array([[0, 0, 1.0], [1, 0, 1.0], [0, 1, z]])
     with pytest.raises(
         ValueError, match=rf"vertices: the nearest has a depth of {z:.3f} m.*in front of the camera"
@@ -233,34 +245,12 @@ def test_a_vertex_not_in_front_of_the_camera_is_an_error(z):
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-def test_a_vertex_that_is_not_finite_is_an_error(value):
+def test_a_vertex_that_is_not_finite_is_an_error(render, value):
     vertices = np.array([[0, 0, 1.0], [1, 0, 1.0], [0, value, 1]])
     with pytest.raises(ValueError, match="vertices: NaN or infinite values"):
         render(vertices, [(0, 1, 2)], SMALL)
 
 
-def test_vertices_without_a_batch_dimension_are_an_error():
+def test_vertices_without_a_batch_dimension_are_an_error(renderer):
     with pytest.raises(ValueError, match=r"vertices: expected \(B, V, 3\), got \(4, 3\)"):
-        get_renderer("zbuffer")(torch.ones(4, 3), torch.tensor([[0, 1, 2]]), SMALL)
-
-
-def test_an_unknown_renderer_is_an_error_that_names_the_known_ones():
-    with pytest.raises(
-        ValueError, match="renderer: expected one of auto, zbuffer, pyrender, open3d, got 'opengl'"
-    ):
-        get_renderer("opengl")
-    assert RENDERERS[0] == "auto"
-
-
-def test_auto_is_the_z_buffer():
-    assert type(get_renderer("auto")) is type(get_renderer("zbuffer"))
-
-
-def test_importing_the_package_loads_nothing_heavy():
-    code = (
-        "import sys; import ljn, ljn.render\n"
-        "loaded = {'numba', 'open3d', 'pyrender', 'wandb'} & set(sys.modules)\n"
-        "assert not loaded, loaded"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
-    assert done.returncode == 0, done.stderr
+        renderer(torch.ones(4, 3), torch.tensor([[0, 1, 2]]), SMALL)
