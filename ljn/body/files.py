@@ -7,9 +7,10 @@ either package and without running anything.
 import hashlib
 import io
 import pickle
+import re
 import zipfile
 import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -141,12 +142,11 @@ def load_body_model(path: str | Path | None = None, gender: str = "neutral") -> 
             f"path: there is no body model file {path}. Leave the path out for the embedded body; the "
             "official files are at https://smpl.is.tue.mpg.de, after registration."
         )
-    readers: dict[str, Callable[[bytes], Mapping[str, Any]]] = {".npz": _read_npz, ".pkl": _read_pkl}
-    if path.suffix.lower() not in readers:
+    if path.suffix.lower() not in _READERS:
         raise ValueError(f"path: a body model should be a .npz or .pkl file, got {path}")
 
     try:
-        arrays = readers[path.suffix.lower()](path.read_bytes())
+        arrays = _READERS[path.suffix.lower()](path.read_bytes())
     except ForbiddenContentError as error:
         raise ValueError(f"{path}: {error} {_NOT_SMPL}") from error
     except _READ_ERRORS as error:
@@ -154,6 +154,50 @@ def load_body_model(path: str | Path | None = None, gender: str = "neutral") -> 
             f"{path}: cannot be read ({error}): damaged, or no SMPL model. Fetch it again."
         ) from error
     return _assemble(arrays, gender, path)
+
+
+def load_body_models(path: str | Path | None, genders: Sequence[str]) -> tuple[BodyModel, ...]:
+    """The bodies of several genders: the embedded ones, or a user's files.
+
+    Args:
+        path: None takes the embedded bodies. A folder gives each gender from `SMPL_FEMALE.pkl`, `female.npz` or
+            the official `basicmodel_f_lbs_...pkl` in it (capitals do not matter). A file serves one gender.
+        genders: Keys of `GENDERS`.
+
+    Returns:
+        One model for each gender, in the order asked for.
+
+    Raises:
+        FileNotFoundError: No file for a gender.
+        ValueError: A file for several genders; several files for a gender; or see `load_body_model`.
+    """
+    for gender in genders:
+        _check_gender(gender)
+    if path is None or not Path(path).is_dir():
+        if path is not None and Path(path).is_file() and len(genders) > 1:
+            raise ValueError(
+                f"path: the file {path} holds one body, but bodies of {', '.join(genders)} are asked for; give a "
+                "folder with a file for each, or ask for one gender (body.genders=[neutral])"
+            )
+        return tuple(load_body_model(path, gender) for gender in genders)
+
+    def file_of(gender: str) -> Path:
+        files = [
+            file
+            for file in sorted(Path(path).iterdir())
+            if file.suffix.lower() in _READERS and _FILE_NAMES[gender].fullmatch(file.stem.lower())
+        ]
+        if not files:
+            raise FileNotFoundError(
+                f"path: no body of gender {gender} in {path}; expected SMPL_{gender.upper()}.pkl, {gender}.npz or the "
+                "official name (basicmodel_..._lbs_10_207_0_v1.1.0.pkl). Put it there, or leave the gender out (body.genders)"
+            )
+        if len(files) > 1:
+            names = ", ".join(file.name for file in files)
+            raise ValueError(f"path: several bodies of gender {gender} in {path}: {names}; leave one there")
+        return files[0]
+
+    return tuple(load_body_model(file_of(gender), gender) for gender in genders)
 
 
 def _assemble(arrays: Mapping[str, Any], gender: str, path: Path) -> BodyModel:
@@ -205,6 +249,11 @@ def _read_pkl(data: bytes) -> dict[str, NDArray[Any]]:
     return read_pickled_arrays(data, _KEYS)
 
 
+_FILE_NAMES = {
+    gender: re.compile(rf"(smpl_)?{gender}|basicmodel_{official}_.*")
+    for gender, official in (("female", "f"), ("male", "m"), ("neutral", "neutral"))
+}
+_READERS: dict[str, Callable[[bytes], Mapping[str, Any]]] = {".npz": _read_npz, ".pkl": _read_pkl}
 _READ_ERRORS = (
     ArithmeticError, AttributeError, EOFError, LookupError, MemoryError, OSError, RuntimeError, TypeError,
     ValueError, pickle.UnpicklingError, zipfile.BadZipFile, zlib.error,

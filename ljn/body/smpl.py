@@ -107,8 +107,25 @@ class SMPL(nn.Module):
             Vertices `(..., V, 3)` and joints `(..., 24, 3)`, metres.
         """
         _check_shape("pose", pose, pose.shape[:-1], 3 * NUM_JOINTS)
-        _check_shape("betas", betas, pose.shape[:-1], NUM_BETAS)
-        vertices, joints = self._by_gender(self._pose, gender, betas, pose)
+        with torch.autocast(pose.device.type, enabled=False):
+            rotvecs = pose.to(self._v_template.dtype).unflatten(-1, (NUM_JOINTS, 3))
+            return self.from_rotmats(rotvec_to_rotmat(rotvecs), betas, gender)
+
+    def from_rotmats(self, rotmats: Tensor, betas: Tensor, gender: Tensor | None = None) -> SMPLOutput:
+        """Posed vertices and joints, from rotation matrices.
+
+        Args:
+            rotmats: `(..., 24, 3, 3)`, relative to the parent joint, as the vectors of `forward`'s `pose`.
+            betas: `(..., 10)`, see `forward`.
+            gender: `(...)`, see `forward`.
+
+        Returns:
+            Vertices `(..., V, 3)` and joints `(..., 24, 3)`, metres.
+        """
+        if rotmats.shape[-3:] != (NUM_JOINTS, 3, 3):
+            raise ValueError(f"rotmats: expected shape (..., {NUM_JOINTS}, 3, 3), got {tuple(rotmats.shape)}")
+        _check_shape("betas", betas, rotmats.shape[:-3], NUM_BETAS)
+        vertices, joints = self._by_gender(self._pose, gender, betas, rotmats.flatten(-3))
         return SMPLOutput(vertices, joints)
 
     def rest_joints(self, betas: Tensor, gender: Tensor | None = None) -> Tensor:
@@ -124,6 +141,29 @@ class SMPL(nn.Module):
         _check_shape("betas", betas, betas.shape[:-1], NUM_BETAS)
         (joints,) = self._by_gender(lambda slot, flat: (self._rest_joints(slot, flat),), gender, betas)
         return joints
+
+    @torch.no_grad()
+    def fit_betas(self, vertices: Tensor) -> Tensor:
+        """The shape whose rest mesh comes nearest to a mesh, by least squares; where one body is loaded.
+
+        Args:
+            vertices: `(..., V, 3)`, metres, in rest pose (T-pose, SMPL's rest frame).
+
+        Returns:
+            `(..., 10)`.
+
+        Raises:
+            ValueError: Several bodies are loaded, or the mesh has another number of vertices.
+        """
+        self._groups(None, torch.Size())
+        if vertices.shape[-2:] != (self.num_vertices, 3):
+            raise ValueError(
+                f"vertices: expected (..., {self.num_vertices}, 3), got {tuple(vertices.shape)}: another mesh topology"
+            )
+        offset = vertices.mT.flatten(-2).double() - self._v_template[0].double()
+        basis = self._directions[0][:NUM_BETAS].double()
+        inverse = torch.linalg.inv(basis @ basis.T)
+        return (offset @ basis.T @ inverse).to(vertices.dtype)
 
     def _by_gender(
         self, body: Callable[..., tuple[Tensor, ...]], gender: Tensor | None, *inputs: Tensor
@@ -161,8 +201,8 @@ class SMPL(nn.Module):
         joints = torch.addmm(self._J_template[slot], betas, self._J_shapedirs[slot])
         return joints.unflatten(-1, (NUM_JOINTS, 3))
 
-    def _pose(self, slot: int, betas: Tensor, pose: Tensor) -> tuple[Tensor, Tensor]:
-        rotmats = rotvec_to_rotmat(pose.unflatten(-1, (NUM_JOINTS, 3)))  # (B, 24, 3, 3)
+    def _pose(self, slot: int, betas: Tensor, rotmats: Tensor) -> tuple[Tensor, Tensor]:
+        rotmats = rotmats.unflatten(-1, (NUM_JOINTS, 3, 3))
         rest_joints = self._rest_joints(slot, betas)
         transforms = self._forward_kinematics(rotmats, rest_joints)  # (B, 24, 3, 4)
         joints = transforms[..., 3]

@@ -10,7 +10,7 @@ import pytest
 import scipy.sparse
 import torch
 
-from ljn.body import BodyModel, load_body_model
+from ljn.body import BodyModel, load_body_model, load_body_models
 from ljn.body.files import GENDERS
 from ljn.body.skeleton import PARENTS
 from ljn.body.smpl import SMPL
@@ -501,3 +501,45 @@ def test_a_pickle_of_something_else_is_refused(tmp_path):
         load_body_model(write_pickle(tmp_path / "list.pkl", [1, 2]))
     with pytest.raises(ValueError, match="weights should be an array"):
         load_body_model(write_pickle(tmp_path / "text.pkl", {**smpl_fields(), "weights": "none"}))
+
+
+# Bodies of several genders
+
+
+def test_embedded_bodies_come_in_the_order_asked_for():
+    bodies = load_body_models(None, ["male", "neutral", "female"])
+    assert [body.gender for body in bodies] == ["male", "neutral", "female"]
+    assert len({body.hash for body in bodies}) == 3
+
+
+@pytest.mark.parametrize(
+    ("gender", "name"),
+    [
+        ("female", "SMPL_FEMALE.npz"),
+        ("male", "male.NPZ"),
+        ("female", "basicModel_f_lbs_10_207_0_v1.0.0.npz"),
+        ("neutral", "basicmodel_neutral_lbs_10_207_0_v1.1.0.npz"),
+    ],
+)
+def test_a_folder_gives_each_gender_its_file(gender, name, tmp_path):
+    embedded = load_body_model(gender=gender)
+    (tmp_path / name).write_bytes(embedded.path.read_bytes())
+    (tmp_path / "readme.txt").touch()
+    (body,) = load_body_models(tmp_path, [gender])
+    assert (body.hash, body.gender) == (embedded.hash, gender)
+
+
+def test_bad_files_of_bodies_are_named(tmp_path):
+    file = load_body_model(gender="male").path
+    with pytest.raises(ValueError, match=r"holds one body, but bodies of female, male .*body\.genders"):
+        load_body_models(file, ["female", "male"])
+    with pytest.raises(FileNotFoundError, match=r"missing\.npz"):
+        load_body_models(tmp_path / "missing.npz", ["female", "male"])
+    (tmp_path / "male.npz").write_bytes(file.read_bytes())
+    with pytest.raises(FileNotFoundError, match=r"no body of gender female .*SMPL_FEMALE\.pkl"):
+        load_body_models(tmp_path, ["male", "female"])
+    (tmp_path / "SMPL_MALE.npz").write_bytes(file.read_bytes())
+    with pytest.raises(ValueError, match=r"several bodies of gender male .*SMPL_MALE\.npz, male\.npz"):
+        load_body_models(tmp_path, ["male"])
+    with pytest.raises(ValueError, match="expected one of female, male, neutral, got 'child'"):
+        load_body_models(None, ["child"])

@@ -41,32 +41,34 @@ def layer(embedded):
     return SMPL(embedded)
 
 
-@pytest.fixture(scope="module")
-def reference(embedded, tmp_path_factory):
-    """The embedded body in the reference implementation, which reads only plain pickles."""
+@pytest.fixture(scope="module", params=sorted(GENDERS))
+def body_and_reference(request, tmp_path_factory):
+    """An embedded body, and the same in the reference implementation, which reads only plain pickles."""
     smplx = pytest.importorskip("smplx", reason="smplx is not installed")
     sparse = pytest.importorskip("scipy.sparse", reason="SciPy is not installed")
+    body = load_body_model(gender=request.param)
     fields = {
-        "v_template": embedded.v_template,
-        "shapedirs": embedded.shapedirs,
-        "posedirs": embedded.posedirs,
-        "J_regressor": sparse.csc_matrix(embedded.J_regressor),
-        "weights": embedded.weights,
+        "v_template": body.v_template,
+        "shapedirs": body.shapedirs,
+        "posedirs": body.posedirs,
+        "J_regressor": sparse.csc_matrix(body.J_regressor),
+        "weights": body.weights,
         "kintree_table": np.array([[2**32 - 1, *PARENTS[1:]], range(NUM_JOINTS)]),
-        "f": embedded.faces.astype(np.uint32),
+        "f": body.faces.astype(np.uint32),
     }
     path = tmp_path_factory.mktemp("reference") / "body.pkl"
     path.write_bytes(pickle.dumps(fields))
-    return smplx.SMPL(str(path), dtype=DTYPE)
+    return body, smplx.SMPL(str(path), dtype=DTYPE)
 
 
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 1e-5), (torch.float64, 1e-6)])
 @pytest.mark.parametrize("scale", [0.3, 1.0, 3.0])
-def test_vertices_and_joints_equal_smplx(embedded, reference, scale, dtype, tolerance):
+def test_vertices_and_joints_equal_smplx(body_and_reference, scale, dtype, tolerance):
+    body, reference = body_and_reference
     pose, betas = draw(4)
     pose = scale * pose
     expected = reference(betas=betas, global_orient=pose[:, :3], body_pose=pose[:, 3:])
-    output = SMPL(embedded).to(dtype)(pose.to(dtype), betas.to(dtype))
+    output = SMPL(body).to(dtype)(pose.to(dtype), betas.to(dtype))
     torch.testing.assert_close(output.vertices.to(DTYPE), expected.vertices, atol=tolerance, rtol=0)
     torch.testing.assert_close(
         output.joints.to(DTYPE), expected.joints[:, :NUM_JOINTS], atol=tolerance, rtol=0
@@ -282,3 +284,46 @@ def test_the_gpu_gives_the_same_body(embedded, layer):
     output = SMPL(embedded).cuda()(pose.cuda(), betas.cuda(), torch.full((16,), GENDERS["neutral"]).cuda())
     torch.testing.assert_close(output.vertices.cpu(), expected.vertices, atol=1e-5, rtol=0)
     torch.testing.assert_close(output.joints.cpu(), expected.joints, atol=1e-5, rtol=0)
+
+
+# Rotation matrices and shapes
+
+
+def test_rotation_matrices_give_the_same_body_as_their_vectors():
+    layer = SMPL(tiny_body()).double()
+    pose, betas = draw(2, 3)
+    rotmats = rotvec_to_rotmat(pose.unflatten(-1, (24, 3)))
+    for one, other in zip(layer.from_rotmats(rotmats, betas), layer(pose, betas)):
+        assert torch.equal(one, other)
+    with pytest.raises(ValueError, match=r"rotmats: expected shape \(\.\.\., 24, 3, 3\), got \(2, 3, 72\)"):
+        layer.from_rotmats(pose, betas)
+
+
+@pytest.mark.parametrize("batch", [(), (3,), (2, 3)])
+def test_the_shape_of_a_rest_mesh_is_found_again(batch):
+    layer = SMPL(tiny_body()).double()
+    _, betas = draw(*batch)
+    rest = layer(torch.zeros(*batch, 72, dtype=DTYPE), betas).vertices
+    torch.testing.assert_close(layer.fit_betas(rest), betas)
+
+
+def test_a_fitted_shape_is_the_nearest_of_all():
+    layer = SMPL(tiny_body()).double()
+    target = layer._v_template[0].unflatten(0, (3, -1)).T + 0.1 * torch.randn(
+        layer.num_vertices, 3, dtype=DTYPE, generator=torch.Generator().manual_seed(1)
+    )
+
+    def distance(betas):
+        return (layer(torch.zeros(72, dtype=DTYPE), betas).vertices - target).square().sum()
+
+    betas = layer.fit_betas(target).requires_grad_()
+    distance(betas).backward()
+    assert betas.grad.abs().max() < 1e-7
+
+
+def test_a_shape_is_fitted_to_one_body_of_the_same_mesh():
+    layer = SMPL([tiny_body("female"), tiny_body("male", seed=1)])
+    with pytest.raises(ValueError, match="several bodies are loaded"):
+        layer.fit_betas(torch.zeros(9, 3))
+    with pytest.raises(ValueError, match=r"expected \(\.\.\., 9, 3\), got \(8, 3\)"):
+        SMPL(tiny_body()).fit_betas(torch.zeros(8, 3))

@@ -1,0 +1,172 @@
+"""A page of pictures of the embedded bodies: shapes, poses and part labels, drawn without a display."""
+
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ljn.body.build.measures import posed
+from ljn.body.build.poses import ARMS_DOWN, EXTREME_POSES, pose_vector
+from ljn.body.files import NUM_BETAS, BodyModel
+from ljn.body.parts import PART_NAMES, face_parts
+from ljn.drawing import new_figure
+from ljn.geometry.camera import Camera
+from ljn.geometry.rotations import rotation_about
+from ljn.render import get_renderer
+
+Array = NDArray[np.float64]
+Image = NDArray[np.uint8]
+
+_DISTANCE = 40.0
+"""Metres to the camera: far enough for an almost parallel projection."""
+_SUPERSAMPLING = 2
+_SKIN = np.array([0.80, 0.72, 0.66])
+_LIGHT = np.array([-0.35, -0.55, -0.76])  # towards the light: camera frame, from above and the left
+_VIEWS = {"front": 0.0, "side": -90.0, "back": 180.0, "oblique": -40.0}
+"""How far, in degrees about the vertical, the body is turned before it is drawn."""
+
+
+def draw_body(
+    vertices: Array,
+    faces: NDArray[np.int64],
+    view: str = "front",
+    scale: float = 100.0,
+    width: float = 2.0,
+    height: float = 2.0,
+    centre: tuple[float, float, float] | None = None,
+    colours: Array | None = None,
+) -> Image:
+    """A shaded picture of one mesh on white.
+
+    Args:
+        vertices: `(V, 3)`, metres, SMPL's rest frame (y up, z forward).
+        faces: `(F, 3)`, vertex indices.
+        view: A key of `_VIEWS`.
+        scale: Pixels a metre.
+        width: Of the window, metres.
+        height: Of the window, metres.
+        centre: `(x, y, z)`, metres, the point in the middle of the picture; None takes the mesh's box.
+        colours: `(F, 3)` RGB in 0..1, equal within patches of few different colours; None for skin.
+
+    Returns:
+        `(height * scale, width * scale, 3)` RGB.
+    """
+    turn = rotation_about("y", torch.tensor(np.radians(_VIEWS[view]), dtype=torch.float64)).numpy()
+    middle = (vertices.min(0) + vertices.max(0)) / 2 if centre is None else np.array(centre)
+    seen = (vertices - middle) @ turn.T * [1.0, -1.0, -1.0] + [0.0, 0.0, _DISTANCE]
+    fine = scale * _SUPERSAMPLING
+    columns, rows = round(width * fine), round(height * fine)
+    camera = Camera(_DISTANCE * fine, _DISTANCE * fine, (columns - 1) / 2, (rows - 1) / 2, columns, rows)
+    mesh = torch.from_numpy(np.ascontiguousarray(seen))[None]
+    render = get_renderer("zbuffer")
+    depth = render(mesh, torch.tensor(faces), camera)[0].double().numpy()
+    albedo = np.tile(_SKIN, (rows, columns, 1))
+    if colours is not None:
+        for colour in np.unique(colours, axis=0):
+            patch = torch.from_numpy(faces[(colours == colour).all(1)])
+            albedo[(depth > 0) & (render(mesh, patch, camera)[0].double().numpy() == depth)] = colour
+    image = _shade(depth, albedo, 1 / fine)
+    image = image.reshape(rows // _SUPERSAMPLING, _SUPERSAMPLING, -1, _SUPERSAMPLING, 3).mean((1, 3))
+    return np.round(255 * image).astype(np.uint8)
+
+
+def _shade(depth: Array, albedo: Array, pitch: float) -> Array:
+    """Lambert's shading of a depth image `(H, W)` with pixels of `pitch` metres; white where depth is 0."""
+    hole = depth == 0
+    steps = []
+    for axis in (0, 1):
+        before, after = np.roll(depth, 1, axis), np.roll(depth, -1, axis)
+        backward, forward = depth - before, after - depth
+        # The flatter of the two neighbours: at a silhouette the other one lies on something else.
+        steps.append(np.where(np.abs(backward) < np.abs(forward), backward, forward))
+    normals = np.stack([steps[1], steps[0], np.full_like(depth, -pitch)], -1)
+    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+    light = np.clip(normals @ (_LIGHT / np.linalg.norm(_LIGHT)), 0, 1)
+    return np.where(hole[..., None], 1.0, albedo * (0.25 + 0.75 * light)[..., None])
+
+
+def draw_page(models: list[BodyModel], path: Path, seed: int = 2) -> None:
+    """Writes a page of pictures: each body's T-pose, random and extreme shapes; poses and parts of one.
+
+    Args:
+        models: The bodies; the neutral one, or else the first, shows poses and parts.
+        path: The PNG file.
+        seed: Of the random shapes.
+    """
+    rows: list[tuple[str, Image]] = []
+    rng = np.random.default_rng(seed)
+    standing = pose_vector(ARMS_DOWN)
+    for model in models:
+        template = model.v_template.astype(np.float64)
+        tposes = [draw_body(template, model.faces, view, width=1.9) for view in ("front", "back")]
+        tposes += [draw_body(template, model.faces, "side", width=0.7)]
+        draws = [
+            draw_body(posed(model, standing, rng.normal(size=NUM_BETAS)), model.faces, view, width=0.95)
+            for view in ("front", "oblique") * 6
+        ]
+        rows.append((f"{model.gender}: T-pose; random draws of beta", np.concatenate(tposes + draws, 1)))
+        extremes = [
+            draw_body(posed(model, standing, sign * 2 * unit), model.faces, view, width=0.79)
+            for unit in np.eye(NUM_BETAS)
+            for sign, view in ((-1, "oblique"), (1, "oblique"))
+        ]
+        rows.append((f"{model.gender}: each beta at -2 and +2", np.concatenate(extremes, 1)))
+    model = next((model for model in models if model.gender == "neutral"), models[0])
+    for view in ("front", "side", "back"):
+        bodies = [posed(model, pose_vector(angles)) for angles in EXTREME_POSES.values()]
+        pictures = [draw_body(body, model.faces, view, width=1.25, height=2.3) for body in bodies]
+        rows.append((f"{model.gender}, {view}: {' | '.join(EXTREME_POSES)}", np.concatenate(pictures, 1)))
+    rows.append((f"parts: {', '.join(PART_NAMES)}", _draw_parts(model)))
+    _write(rows, path)
+
+
+def _part_colours() -> Array:
+    """`(P, 3)` RGB in 0..1, one for each name of a part."""
+    from matplotlib import colormaps
+
+    return np.asarray(colormaps["tab20"](np.arange(len(PART_NAMES)) % 20))[:, :3]
+
+
+def _draw_parts(model: BodyModel) -> Image:
+    colours = _part_colours()[face_parts(model)]
+    template = model.v_template.astype(np.float64)
+    squat = posed(model, pose_vector(EXTREME_POSES["squat"]))
+    return np.concatenate(
+        [
+            *(
+                draw_body(template, model.faces, view, width=2.0, colours=colours)
+                for view in ("front", "back")
+            ),
+            *(draw_body(squat, model.faces, view, width=1.2, colours=colours) for view in _VIEWS),
+        ],
+        axis=1,
+    )
+
+
+def _write(rows: list[tuple[str, Image]], path: Path) -> None:
+    """Stacks pictures under their titles, at the pictures' own resolution."""
+    import PIL.Image
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    margin, width = 18, max(image.shape[1] for _, image in rows)
+    height = sum(image.shape[0] + margin for _, image in rows)
+    page = np.full((height, width, 3), 255, np.uint8)
+    figure = new_figure(width / 100, height / 100)
+    figure.set_layout_engine("none")
+    top = 0
+    for title, image in rows:
+        figure.text(4 / width, 1 - (top + 2) / height, title, fontsize=8, va="top")
+        page[top + margin :][: image.shape[0], : image.shape[1]] = image
+        top += image.shape[0] + margin
+    figure.figimage(page, zorder=-1)
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    picture = PIL.Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3])
+    # Colours from a palette make the file a third as large.
+    ramps = [np.linspace(0, 1, 40)[:, None] * _SKIN, np.linspace(1, _SKIN, 10), np.linspace(0, [1, 1, 1], 8)]
+    ramps += [np.linspace(0.2, 1, 11)[:, None] * colour for colour in _part_colours()]
+    palette = PIL.Image.new("P", (1, 1))
+    palette.putpalette(np.round(255 * np.concatenate(ramps)).astype(np.uint8).tobytes())
+    picture.quantize(palette=palette, dither=PIL.Image.Dither.NONE).save(path, optimize=True)
