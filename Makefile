@@ -17,6 +17,7 @@ lint: install
 	$(BIN)/mypy
 
 bench: install
+	$(BIN)/python -m pip install --quiet --editable '.[dev,open3d,pyrender]'
 	$(BIN)/python -m tests.benchmarks.pipeline
 
 install: $(VENV)/.installed

@@ -1,10 +1,11 @@
-"""Pictures of predicted joints: of fixed validation samples while training, of the extremes after a test."""
+"""Pictures of predictions: of fixed validation samples while training, of the extremes after a test."""
 
 import warnings
-from collections.abc import Callable
+from abc import abstractmethod
+from collections.abc import Callable, Sequence
 from functools import wraps
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
@@ -12,16 +13,21 @@ from lightning.pytorch.loggers import WandbLogger
 from lightning.pytorch.trainer.states import TrainerFn
 from torch import Tensor
 
+from ljn.body.skeleton import ROOT
 from ljn.data import Batch
-from ljn.drawing import Sample, draw_samples
+from ljn.drawing import MeshSample, Sample, draw_meshes, draw_samples
+from ljn.geometry.camera import place_at_root
 from ljn.metrics.functional import mpjpe
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 def _never_stops(hook: Callable[..., None]) -> Callable[..., None]:
-    """A hook of `JointPictures` whose errors, whatever they are, become one warning: the run goes on."""
+    """A hook of `Pictures` whose errors, whatever they are, become one warning: the run goes on."""
 
     @wraps(hook)
-    def guarded(self: "JointPictures", *arguments: Any, **keywords: Any) -> None:
+    def guarded(self: "Pictures", *arguments: Any, **keywords: Any) -> None:
         try:
             hook(self, *arguments, **keywords)
         except Exception as error:
@@ -32,8 +38,8 @@ def _never_stops(hook: Callable[..., None]) -> Callable[..., None]:
     return guarded
 
 
-class JointPictures(Callback):
-    """Draws clouds with true (blue) and predicted (red) skeletons, from the front and from the side.
+class Pictures(Callback):
+    """Base: draws pages of samples. A subclass says what to keep of a sample, how bad it is and how it looks.
 
     Files go below `directory`, and to W&B where it is among the loggers. A picture that cannot be drawn warns
     once and never stops a run.
@@ -49,8 +55,18 @@ class JointPictures(Callback):
         self.num_samples = num_samples
         self.every_n_epochs = every_n_epochs
         self.has_warned = False
-        self._validation: list[Sample] = []
-        self._test_joints: list[tuple[Tensor, Tensor]] = []
+        self._validation: list[dict[str, Tensor]] = []
+        self._test: list[dict[str, Tensor]] = []
+
+    @abstractmethod
+    def keep(self, outputs: dict[str, Tensor], batch: Batch) -> dict[str, Tensor]:
+        """What a picture needs of a batch beside its points, small, and `error` `(B,)`, mm."""
+
+    @abstractmethod
+    def draw(
+        self, samples: dict[str, Tensor], titles: Sequence[str], num_columns: int, module: Any
+    ) -> "Figure":
+        """A page of samples: the rows of what was kept, and their `points` `(S, N, 3)`; all on the CPU."""
 
     @_never_stops
     def on_validation_batch_end(
@@ -63,25 +79,25 @@ class JointPictures(Callback):
         dataloader_idx: int = 0,
     ) -> None:
         """Keep the first samples."""
-        if trainer.state.fn != TrainerFn.FITTING or not self._is_due(trainer):
+        missing = self.num_samples - sum(len(kept["error"]) for kept in self._validation)
+        if trainer.state.fn != TrainerFn.FITTING or not self._is_due(trainer) or missing <= 0:
             return
-        for row in range(min(self.num_samples - len(self._validation), len(batch["joints"]))):
-            error = float(mpjpe(outputs["pred_joints"][row], batch["joints"][row]))
-            self._validation.append(
-                _sample(
-                    batch,
-                    outputs["pred_joints"],
-                    row,
-                    f"sample {int(batch['sample_id'][row])}: {error:.0f} mm",
-                )
-            )
+        ids = {"sample_id": batch["sample_id"], "points": batch["points"][..., :3]}
+        kept = self.keep(outputs, batch) | ids
+        self._validation.append({name: value[:missing].detach().cpu() for name, value in kept.items()})
 
     @_never_stops
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Draw them."""
-        samples, self._validation = self._validation, []
-        if samples:
-            self._save(trainer, samples, "val/samples", f"val_epoch_{trainer.current_epoch + 1:03d}")
+        kept, self._validation = self._validation, []
+        if kept:
+            samples = _join(kept)
+            titles = [
+                f"sample {int(number)}: {float(error):.0f} mm"
+                for number, error in zip(samples["sample_id"], samples["error"])
+            ]
+            figure = self.draw(samples, titles, self.num_samples, pl_module)
+            self._save(trainer, figure, "val/samples", f"val_epoch_{trainer.current_epoch + 1:03d}")
 
     @_never_stops
     def on_test_batch_end(
@@ -93,48 +109,46 @@ class JointPictures(Callback):
         batch_idx: int,
         dataloader_idx: int = 0,
     ) -> None:
-        """Keep the joints of every sample."""
-        self._test_joints.append((outputs["pred_joints"].detach().cpu(), batch["joints"].cpu()))
+        """Keep something of every sample."""
+        kept = self.keep(outputs, batch)
+        self._test.append({name: value.detach().cpu() for name, value in kept.items()})
 
     @_never_stops
     def on_test_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Draw the best, the median and the worst samples on a page."""
-        kept, self._test_joints = self._test_joints, []
+        kept, self._test = self._test, []
         if not kept:
             return
-        pred_joints = torch.cat([pred for pred, _ in kept])
-        errors = mpjpe(pred_joints, torch.cat([joints for _, joints in kept]))
-        order = errors.nan_to_num(nan=torch.inf).argsort().tolist()
+        batch_size = len(kept[0]["error"])
+        samples = _join(kept)
+        order = samples["error"].nan_to_num(nan=torch.inf).argsort().tolist()
         number = min(self.num_samples, len(order))
         middle = (len(order) - number) // 2
         kinds = {"best": order[:number], "median": order[middle : middle + number], "worst": order[-number:]}
-        batch_size = len(kept[0][0])
-        needed = {index // batch_size for indices in kinds.values() for index in indices}
+        chosen = [index for indices in kinds.values() for index in indices]
+        # Clouds are too large to keep: those of the chosen samples are read again.
+        needed = {index // batch_size for index in chosen}
         points: dict[int, Tensor] = {}
         for batch_idx, batch in enumerate(trainer.test_dataloaders or []):
             if batch_idx in needed:
                 points |= {batch_idx * batch_size + row: value for row, value in enumerate(batch["points"])}
             if batch_idx >= max(needed):
                 break
-        joints = torch.cat([joints for _, joints in kept])
-        samples = [
-            Sample(
-                points[index][:, :3].numpy(),
-                joints[index].numpy(),
-                pred_joints[index].numpy(),
-                f"{kind}: {float(errors[index]):.0f} mm",
-            )
+        drawn = {name: value[chosen] for name, value in samples.items()}
+        drawn["points"] = torch.stack([points[index][:, :3] for index in chosen])
+        titles = [
+            f"{kind}: {float(samples['error'][index]):.0f} mm"
             for kind, indices in kinds.items()
             for index in indices
         ]
-        self._save(trainer, samples, "test/extremes", "test_best_median_worst")
+        figure = self.draw(drawn, titles, number, pl_module)
+        self._save(trainer, figure, "test/extremes", "test_best_median_worst")
 
     def _is_due(self, trainer: Trainer) -> bool:
         epoch = trainer.current_epoch + 1
         return epoch % self.every_n_epochs == 0 or epoch in (1, trainer.max_epochs)
 
-    def _save(self, trainer: Trainer, samples: list[Sample], key: str, name: str) -> None:
-        figure = draw_samples(samples, self.num_samples)
+    def _save(self, trainer: Trainer, figure: "Figure", key: str, name: str) -> None:
         self.directory.mkdir(parents=True, exist_ok=True)
         path = self.directory / f"{name}.png"
         figure.savefig(path)
@@ -143,7 +157,54 @@ class JointPictures(Callback):
                 logger.log_image(key, [str(path)])
 
 
-def _sample(batch: Batch, pred_joints: Tensor, row: int, title: str) -> Sample:
-    tensors = (batch["points"][row, :, :3], batch["joints"][row], pred_joints[row])
-    points, joints, predicted = (tensor.detach().cpu().numpy() for tensor in tensors)
-    return Sample(points, joints, predicted, title)
+class JointPictures(Pictures):
+    """Clouds with true (blue) and predicted (red) skeletons, from the front and from the side; see `Pictures`."""
+
+    def keep(self, outputs: dict[str, Tensor], batch: Batch) -> dict[str, Tensor]:
+        """See `Pictures.keep`."""
+        pred_joints, joints = outputs["pred_joints"], batch["joints"]
+        return {"error": mpjpe(pred_joints, joints), "pred_joints": pred_joints, "joints": joints}
+
+    def draw(
+        self, samples: dict[str, Tensor], titles: Sequence[str], num_columns: int, module: Any
+    ) -> "Figure":
+        """See `Pictures.draw`."""
+        columns = (samples[name].numpy() for name in ("points", "joints", "pred_joints"))
+        return draw_samples([Sample(*row) for row in zip(*columns, titles)], num_columns)
+
+
+class MeshPictures(Pictures):
+    """Predicted (red) beside true (blue) meshes with the cloud over them, front and side; see `Pictures`."""
+
+    def keep(self, outputs: dict[str, Tensor], batch: Batch) -> dict[str, Tensor]:
+        """See `Pictures.keep`: parameters and roots, from which the meshes are made again."""
+        return {
+            "error": outputs["apve"],
+            "pred_pose": outputs["pred_pose"],
+            "pred_betas": outputs["pred_betas"],
+            "pose": batch["pose"],
+            "betas": batch["betas"],
+            "gender": batch["gender"],
+            "pred_root": outputs["pred_joints"][:, ROOT],
+            "root": batch["joints"][:, ROOT],
+        }
+
+    @torch.no_grad()
+    def draw(
+        self, samples: dict[str, Tensor], titles: Sequence[str], num_columns: int, module: Any
+    ) -> "Figure":
+        """See `Pictures.draw`."""
+        on_device = {name: value.to(module.device) for name, value in samples.items()}
+        meshes = []
+        for layer, names, root in (
+            (module.target_body, ("pose", "betas", "gender"), "root"),
+            (module.body, ("pred_pose", "pred_betas"), "pred_root"),
+        ):
+            vertices, joints = layer(*(on_device[name] for name in names))
+            meshes.append(place_at_root(vertices, joints[:, ROOT], on_device[root]).cpu().numpy())
+        rows = zip(samples["points"].numpy(), *meshes, titles)
+        return draw_meshes([MeshSample(*row) for row in rows], module.body.faces.cpu().numpy(), num_columns)
+
+
+def _join(parts: list[dict[str, Tensor]]) -> dict[str, Tensor]:
+    return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}

@@ -16,7 +16,8 @@ class SampleErrors(Callback):
     """Writes `test_errors.npz` after a test.
 
     It holds, a row a sample: `sample_id` `(S,)`, `errors_mm` and `initial_errors_mm` `(S, 24)`, and `joints`,
-    `pred_joints` and `initial_joints` `(S, 24, 3)` in metres, camera frame.
+    `pred_joints` and `initial_joints` `(S, 24, 3)` in metres, camera frame; of a mesh regressor also `apve_mm`
+    `(S,)`, body frame, `pred_pose` `(S, 72)` and `pred_betas` `(S, 10)`.
 
     Args:
         directory: Where the file goes.
@@ -42,6 +43,9 @@ class SampleErrors(Callback):
             "pred_joints": outputs["pred_joints"],
             "initial_joints": batch["initial_joints"],
         }
+        kept |= {name: outputs[name] for name in ("pred_pose", "pred_betas") if name in outputs}
+        if "apve" in outputs:
+            kept["apve_mm"] = outputs["apve"].float()
         self._batches.append({name: value.detach().cpu() for name, value in kept.items()})
 
     def on_test_end(self, trainer: Trainer, pl_module: LightningModule) -> None:

@@ -12,9 +12,9 @@ from torch import Tensor
 
 from datamodules.placement import HEADINGS, check_margin, draw_heading, place
 from datamodules.sources import PoseRecords
-from ljn.body import GENDERS, SMPL, BodyModel
+from ljn.body import SMPL, BodyModel
 from ljn.cloud.keypoints import lift_keypoints
-from ljn.cloud.normals import NormalEstimator, get_normal_estimator
+from ljn.cloud.normals import NORMALS, NormalEstimator, get_normal_estimator
 from ljn.cloud.sampling import add_depth_noise, sample_cloud
 from ljn.data import Batch
 from ljn.geometry.camera import Camera, project
@@ -22,7 +22,10 @@ from ljn.geometry.rotations import CAMERA_FROM_BODY, rotation_about, rotmat_to_r
 from ljn.render import RENDERERS, Renderer, get_renderer
 
 # Each purpose has a generator of its own: changing one (the number of points, a sigma) leaves the others' draws.
-_PLACEMENT, _DEPTH_NOISE, _SAMPLING, _KEYPOINTS = range(4)
+_PLACEMENT, _DEPTH_NOISE, _SAMPLING, _KEYPOINTS, _JOINTS = range(5)
+
+INITIAL_JOINTS = ("lifted", "noised")
+JOINT_NOISES = ("planar", "isotropic")
 
 
 @dataclass(frozen=True)
@@ -37,8 +40,12 @@ class SynthesisSettings:
         margin_px: Clear border around the body, pixels.
         depth_noise_m: Standard deviation of the depth noise, metres.
         keypoint_noise_px: Standard deviation of the keypoints' noise, pixels.
+        initial_joints: `lifted` (noisy keypoints with the depth at their pixels) or `noised` (true joints with
+            noise).
+        joint_noise_m: Standard deviation of the noise of `noised`, metres.
+        joint_noise: Its directions: `planar` (the camera's x and y) or `isotropic`.
         renderer: A name that `ljn.render.get_renderer` knows.
-        normals: `window` or `open3d`.
+        normals: One of `ljn.cloud.normals.NORMALS`.
     """
 
     camera: Camera
@@ -48,20 +55,29 @@ class SynthesisSettings:
     margin_px: float = 8.0
     depth_noise_m: float = 0.001
     keypoint_noise_px: float = 10.0
+    initial_joints: str = "lifted"
+    joint_noise_m: float = 0.02
+    joint_noise: str = "planar"
     renderer: str = "auto"
     normals: str = "window"
 
     def __post_init__(self) -> None:
         if self.num_points < 1:
             raise ValueError(f"num_points: expected at least 1, got {self.num_points}")
-        if self.heading not in HEADINGS:
-            raise ValueError(f"heading: expected one of {', '.join(HEADINGS)}, got '{self.heading}'")
-        if self.renderer not in RENDERERS:
-            raise ValueError(f"renderer: expected one of {', '.join(RENDERERS)}, got '{self.renderer}'")
+        choices = {
+            "heading": HEADINGS,
+            "initial_joints": INITIAL_JOINTS,
+            "joint_noise": JOINT_NOISES,
+            "renderer": RENDERERS,
+            "normals": NORMALS,
+        }
+        for name, known in choices.items():
+            if getattr(self, name) not in known:
+                raise ValueError(f"{name}: expected one of {', '.join(known)}, got '{getattr(self, name)}'")
         check_margin(self.camera, self.margin_px)
         if not 0 < self.distance_m[0] <= self.distance_m[1]:
             raise ValueError(f"distance_m: expected 0 < nearest <= farthest, got {self.distance_m}")
-        for name in ("margin_px", "depth_noise_m", "keypoint_noise_px"):
+        for name in ("margin_px", "depth_noise_m", "keypoint_noise_px", "joint_noise_m"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value >= 0):
                 raise ValueError(f"{name}: expected a number of 0 or more, got {value}")
@@ -74,7 +90,7 @@ class DepthSynthesizer:
 
     Args:
         records: The poses and shapes.
-        body: The body.
+        bodies: A body for each gender among the records.
         settings: See `SynthesisSettings`.
         seed_key: What the random draws hang on, beside a sample's epoch and index: a seed and a split number.
         dtype: Precision of the body; float64 makes fixed sets agree across machines.
@@ -83,7 +99,7 @@ class DepthSynthesizer:
     def __init__(
         self,
         records: PoseRecords,
-        body: BodyModel,
+        bodies: Sequence[BodyModel],
         settings: SynthesisSettings,
         seed_key: tuple[int, int],
         dtype: torch.dtype = torch.float32,
@@ -93,7 +109,7 @@ class DepthSynthesizer:
                 "heading: these poses carry no heading of their own; use 'histogram' or 'uniform'"
             )
         self.records = records
-        self.body = body
+        self.bodies = bodies
         self.settings = settings
         self.seed_key = seed_key
         self.dtype = dtype
@@ -104,7 +120,7 @@ class DepthSynthesizer:
 
     @cached_property
     def _smpl(self) -> SMPL:
-        return SMPL(self.body).to(self.dtype)
+        return SMPL(self.bodies).to(self.dtype)
 
     @cached_property
     def _renderer(self) -> Renderer:
@@ -141,7 +157,8 @@ class DepthSynthesizer:
         pose = torch.cat([rotmat_to_rotvec(root), pose[:, 3:]], -1)
         betas = torch.from_numpy(self.records.betas[rows]).to(self.dtype)
 
-        vertices, joints = self._smpl(pose, betas)
+        gender = torch.from_numpy(self.records.gender[rows])
+        vertices, joints = self._smpl(pose, betas, gender)
         cam_from_body = CAMERA_FROM_BODY.to(self.dtype)
         vertices, joints = vertices @ cam_from_body.T, joints @ cam_from_body.T
         transl = torch.from_numpy(
@@ -157,7 +174,7 @@ class DepthSynthesizer:
         depth = self._renderer(vertices, self._smpl.faces, camera).numpy()
         for image, (epoch, index) in zip(depth, keys):
             image[:] = add_depth_noise(image, settings.depth_noise_m, self._rng(epoch, index, _DEPTH_NOISE))
-        return _Scene(pose, betas, joints, depth)
+        return _Scene(pose, betas, gender, joints, depth)
 
     def _observe(self, keys: Sequence[tuple[int, int]], scene: "_Scene") -> Batch:
         """Sample the depth images to clouds with normals; make the initial joints."""
@@ -175,7 +192,15 @@ class DepthSynthesizer:
             noisy_keypoints[i] = add_keypoint_noise(
                 keypoints[i].numpy(), settings.keypoint_noise_px, camera, self._rng(epoch, index, _KEYPOINTS)
             )
-            initial_joints[i] = lift_keypoints(noisy_keypoints[i], depth, camera)
+            if settings.initial_joints == "lifted":
+                initial_joints[i] = lift_keypoints(noisy_keypoints[i], depth, camera)
+            else:
+                initial_joints[i] = add_joint_noise(
+                    scene.joints[i].numpy(),
+                    settings.joint_noise_m,
+                    settings.joint_noise,
+                    self._rng(epoch, index, _JOINTS),
+                )
         return Batch(
             points=torch.from_numpy(points),
             keypoints_2d=keypoints,
@@ -184,17 +209,18 @@ class DepthSynthesizer:
             joints=scene.joints.float(),
             pose=scene.pose.float(),
             betas=scene.betas.float(),
-            gender=torch.full((len(keys),), GENDERS[self.body.gender]),
+            gender=scene.gender,
             camera=intrinsics.float(),
             sample_id=torch.tensor([index for _, index in keys]),
         )
 
 
 class _Scene(NamedTuple):
-    """Bodies before the camera: `(B, 72)`, `(B, 10)`, `(B, 24, 3)` and noisy depth `(B, H, W)`, metres."""
+    """Bodies before the camera: `(B, 72)`, `(B, 10)`, `(B,)`, `(B, 24, 3)` and noisy depth `(B, H, W)`, metres."""
 
     pose: Tensor
     betas: Tensor
+    gender: Tensor
     joints: Tensor
     depth: np.ndarray
 
@@ -214,6 +240,24 @@ def add_keypoint_noise(
     if camera is not None:
         noisy = noisy.clip(0, [camera.width - 1, camera.height - 1])
     return noisy.astype(np.float32)
+
+
+def add_joint_noise(joints: np.ndarray, noise_m: float, kind: str, rng: np.random.Generator) -> np.ndarray:
+    """Joints as a joint detector might give them (section 3.6.3).
+
+    Args:
+        joints: `(K, 3)`, metres, camera frame.
+        noise_m: Standard deviation of the Gaussian noise along each direction, metres.
+        kind: `planar` (x and y, whose mean distance sigma * sqrt(pi / 2) is that of Table 3.6) or `isotropic`.
+        rng: Source of the draws; they depend on neither `noise_m` nor `kind`.
+
+    Returns:
+        `(K, 3)` float32.
+    """
+    noise = rng.standard_normal(joints.shape)
+    if kind == "planar":
+        noise[:, 2] = 0
+    return (joints + noise_m * noise).astype(np.float32)
 
 
 def concatenate(batches: Iterable[Batch], num_samples: int) -> dict[str, Tensor]:

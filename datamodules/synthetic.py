@@ -3,6 +3,7 @@
 import hashlib
 import logging
 from collections.abc import Iterator, Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import Any, cast
 
@@ -11,17 +12,17 @@ from torch import Tensor
 from torch.utils.data import BatchSampler, DataLoader, Dataset, Sampler
 
 from datamodules.cache import cached_samples
-from datamodules.sources import SPLITS, PoseSource
+from datamodules.sources import PoseRecords, PoseSource
 from datamodules.synthesis import DepthSynthesizer, SynthesisSettings, concatenate
-from ljn.body import BodyModel, load_body_model
+from ljn.body import BodyModel, load_body_models
 from ljn.cloud.normals import get_normal_estimator
-from ljn.data import Batch, BodyDataModule
+from ljn.data import EMBEDDED_DATA_VERSION, SPLITS, Batch, BodyDataModule
 from ljn.geometry.camera import Camera
+from ljn.modules.joint_detector import JointDetector
 from ljn.render import get_renderer
+from ljn.tasks.checkpoints import Checkpoint, load_module
 
 _LOG = logging.getLogger(__name__)
-# Raise it when the same settings begin to give other samples: cached sets of before are then left alone.
-_SAMPLES_VERSION = 2
 _CHUNK = 16
 
 
@@ -44,8 +45,8 @@ class SyntheticDepthDataModule(BodyDataModule):
         pool_seed: Seed of the poses and shapes.
         eval_seed: Seed of the validation and test samples' draws.
         cache_dir: Where the fixed sets are kept.
-        body_path: SMPL-format file; the embedded body by default.
-        body_gender: Which embedded body, or which gender the file holds.
+        body_path: SMPL-format file, or a folder of them; the embedded bodies by default. See
+            `load_body_models`.
         redraw_each_epoch: Whether headings, places, noise and points are drawn anew in every epoch.
         num_workers: Worker processes; 0 renders in the main process.
         prefetch_batches: Batches that each worker keeps ready.
@@ -54,8 +55,13 @@ class SyntheticDepthDataModule(BodyDataModule):
         margin_px: Clear border around the body, pixels.
         depth_noise_m: Standard deviation of the depth noise, metres.
         keypoint_noise_px: Standard deviation of the keypoints' noise, pixels.
+        initial_joints: `lifted` and `noised`, see `SynthesisSettings`; or `detector`: what a trained joint
+            detector makes of the lifted ones, run on the training device.
+        joint_noise_m: See `SynthesisSettings`.
+        joint_noise: See `SynthesisSettings`.
+        detector_ckpt: The detector's checkpoint.
         renderer: See `ljn.render.get_renderer`.
-        normals: `window` or `open3d`.
+        normals: See `ljn.cloud.normals.get_normal_estimator`.
     """
 
     def __init__(
@@ -72,7 +78,6 @@ class SyntheticDepthDataModule(BodyDataModule):
         eval_seed: int,
         cache_dir: str | Path,
         body_path: str | Path | None = None,
-        body_gender: str = "neutral",
         redraw_each_epoch: bool = True,
         num_workers: int = 1,
         prefetch_batches: int = 4,
@@ -81,6 +86,10 @@ class SyntheticDepthDataModule(BodyDataModule):
         margin_px: float = 8.0,
         depth_noise_m: float = 0.001,
         keypoint_noise_px: float = 10.0,
+        initial_joints: str = "lifted",
+        joint_noise_m: float = 0.02,
+        joint_noise: str = "planar",
+        detector_ckpt: str | Path | None = None,
         renderer: str = "auto",
         normals: str = "window",
     ) -> None:
@@ -93,9 +102,18 @@ class SyntheticDepthDataModule(BodyDataModule):
             margin_px=float(margin_px),
             depth_noise_m=float(depth_noise_m),
             keypoint_noise_px=float(keypoint_noise_px),
+            initial_joints="lifted" if initial_joints == "detector" else initial_joints,
+            joint_noise_m=float(joint_noise_m),
+            joint_noise=joint_noise,
             renderer=renderer,
             normals=normals,
         )
+        if (initial_joints == "detector") != (detector_ckpt is not None):
+            raise ValueError(
+                f"initial_joints, detector_ckpt: expected a checkpoint for 'detector' and for nothing else, got "
+                f"'{initial_joints}' and {detector_ckpt}; use data.initial_joints=detector data.detector_ckpt=FILE"
+            )
+        self.detector_ckpt = detector_ckpt
         self.source = source
         self.sizes = {"train": num_train, "val": num_val, "test": num_test}
         for split, size in self.sizes.items():
@@ -107,25 +125,27 @@ class SyntheticDepthDataModule(BodyDataModule):
         self.eval_seed = eval_seed
         self.cache_dir = Path(cache_dir)
         self.body_path = body_path
-        self.body_gender = body_gender
         self.redraw_each_epoch = redraw_each_epoch
         self.num_workers = num_workers
         self.prefetch_batches = prefetch_batches
-        self._body: BodyModel | None = None
+        self._bodies: tuple[BodyModel, ...] | None = None
+        self._records: dict[str, PoseRecords] = {}
         self._train: DepthSynthesizer | None = None
         self._fixed: dict[str, Dataset] = {}
 
     @property
-    def body(self) -> BodyModel:
-        """The body, read on first use."""
-        if self._body is None:
-            self._body = load_body_model(self.body_path, self.body_gender)
-        return self._body
+    def bodies(self) -> tuple[BodyModel, ...]:
+        """A body for each of the source's genders, read on first use."""
+        if self._bodies is None:
+            self._bodies = load_body_models(self.body_path, self.source.genders)
+        return self._bodies
 
     @property
     def fingerprint(self) -> str:
         """See `BodyDataModule`."""
-        made_of = f"{_SAMPLES_VERSION} {self.body.hash} {self.source.name} {self.source.fingerprint}"
+        made_of = f"{EMBEDDED_DATA_VERSION} {self.body_hash} {self.source.name} {self.source.fingerprint}"
+        if self._detector_checkpoint is not None:
+            made_of += f" {self._detector_checkpoint[1].file_hash}"
         return hashlib.sha256(made_of.encode()).hexdigest()[:16]
 
     @property
@@ -135,40 +155,76 @@ class SyntheticDepthDataModule(BodyDataModule):
 
     def examples(self, num_samples: int) -> tuple[Batch, Tensor]:
         """See `BodyDataModule`."""
-        return self._make_train_synthesizer(num_samples).examples(
-            [(0, index) for index in range(num_samples)]
-        )
+        if num_samples > self.sizes["train"]:
+            raise ValueError(
+                f"num_samples: there are {self.sizes['train']} training samples, got {num_samples}; ask for fewer, "
+                "or raise data.num_train"
+            )
+        batch, depth = self._train_synthesizer().examples([(0, index) for index in range(num_samples)])
+        return self.on_after_batch_transfer(batch, 0), depth
 
-    def describe(self) -> dict[str, Any]:
+    def describe(self, splits: Sequence[str] = SPLITS) -> dict[str, Any]:
         """See `BodyDataModule`."""
         return {
             "source": self.source.name,
+            "version": EMBEDDED_DATA_VERSION,
             "fingerprint": self.fingerprint,
             "licence": self.source.licence,
-            "sizes": self.sizes,
-            "body": {"hash": self.body.hash, "gender": self.body.gender},
+            "sizes": {split: self.sizes[split] for split in splits},
+            "pool": {split: self._records_of(split).hash for split in splits},
+            "bodies": {body.gender: body.hash for body in self.bodies},
+            "detector": None
+            if self._detector_checkpoint is None
+            else {"path": str(self.detector_ckpt), "hash": self._detector_checkpoint[1].file_hash},
             "seeds": {"seed": self.seed, "pool_seed": self.pool_seed, "eval_seed": self.eval_seed},
         }
 
     def prepare_data(self) -> None:
         """Check every file and package that will be needed, before anything expensive starts."""
         self.source.check()
-        _ = self.body
+        _ = self.bodies
+        if self._detector_checkpoint is not None:
+            checkpoint = self._detector_checkpoint[1]
+            if unknown := [body for body in self.bodies if body.hash not in checkpoint.body_hash.split("-")]:
+                raise ValueError(
+                    f"detector_ckpt: '{self.detector_ckpt}' was trained with the bodies {checkpoint.body_hash}, and "
+                    f"{unknown[0].gender} {unknown[0].hash} is not among them; a model is only meaningful with its "
+                    "bodies"
+                )
         get_renderer(self.settings.renderer)
         get_normal_estimator(self.settings.normals)
+
+    @cached_property
+    def _detector_checkpoint(self) -> tuple[JointDetector, Checkpoint] | None:
+        if self.detector_ckpt is None:
+            return None
+        return load_module(self.detector_ckpt, JointDetector, "detector_ckpt")
+
+    @torch.no_grad()
+    def on_after_batch_transfer(self, batch: Batch, dataloader_idx: int) -> Batch:
+        """Let the detector, where there is one, move the initial joints; on the device of the batch."""
+        if self._detector_checkpoint is None:
+            return batch
+        detector = self._detector_checkpoint[0].to(batch["points"].device)
+        return Batch(**{**batch, "initial_joints": detector(batch["points"], batch["initial_joints"])})
 
     def setup(self, stage: str) -> None:
         """Build the sets that a stage (`fit`, `validate` or `test`) needs."""
         if stage == "fit" and self._train is None:
-            self._train = self._make_train_synthesizer(self.sizes["train"])
+            self._train = self._train_synthesizer()
         needed = {"fit": ["val"], "validate": ["val"], "test": ["test"]}[stage]
         for split in needed:
             if split not in self._fixed:
                 self._fixed[split] = FixedSamples(self._fixed_samples(split))
 
-    def _make_train_synthesizer(self, num_records: int) -> DepthSynthesizer:
-        records = self.source.records("train", num_records, self.pool_seed)
-        return DepthSynthesizer(records, self.body, self.settings, (self.seed, SPLITS.index("train")))
+    def _records_of(self, split: str) -> PoseRecords:
+        if split not in self._records:
+            self._records[split] = self.source.records(split, self.sizes[split], self.pool_seed)
+        return self._records[split]
+
+    def _train_synthesizer(self) -> DepthSynthesizer:
+        seed_key = (self.seed, SPLITS.index("train"))
+        return DepthSynthesizer(self._records_of("train"), self.bodies, self.settings, seed_key)
 
     def train_dataloader(self) -> DataLoader:
         """Samples rendered as they are needed; the last, incomplete batch is dropped."""
@@ -194,9 +250,9 @@ class SyntheticDepthDataModule(BodyDataModule):
     def _fixed_samples(self, split: str) -> dict[str, Tensor]:
         def make() -> dict[str, Tensor]:
             _LOG.info("rendering %d %s samples", self.sizes[split], split)
-            records = self.source.records(split, self.sizes[split], self.pool_seed)
+            records = self._records_of(split)
             synthesizer = DepthSynthesizer(
-                records, self.body, self.settings, (self.eval_seed, SPLITS.index(split)), torch.float64
+                records, self.bodies, self.settings, (self.eval_seed, SPLITS.index(split)), torch.float64
             )
             # Chunks of one size whatever the batch size: the body's products then round alike.
             keys = [(0, index) for index in range(len(records))]

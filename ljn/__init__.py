@@ -12,9 +12,10 @@ _PUBLIC = {
     "Camera": "ljn.geometry.camera",
     "SMPL": "ljn.body.smpl",
     "JointDetector": "ljn.modules.joint_detector",
+    "Pipeline": "ljn.system.pipeline",
     "get_renderer": "ljn.render",
 }
-__all__ = ["SMPL", "Camera", "JointDetector", "__version__", "get_renderer"]
+__all__ = ["SMPL", "Camera", "JointDetector", "Pipeline", "__version__", "get_renderer"]
 
 
 def __getattr__(name: str) -> Any:

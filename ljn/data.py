@@ -1,12 +1,19 @@
 """The contract between data, models and tasks: what a batch holds, what a data module can say of itself."""
 
 from abc import abstractmethod
+from collections.abc import Sequence
 from typing import Any, TypedDict
 
 from lightning.pytorch import LightningDataModule
 from torch import Tensor
 
 from ljn.body import BodyModel
+
+EMBEDDED_DATA_VERSION = 1
+"""Raised with every change of the embedded bodies, of the poses generated from the embedded clips, or of the samples
+made of them, because results are comparable within a version only. A test holds their hashes."""
+
+SPLITS = ("train", "val", "test")
 
 
 class Batch(TypedDict):
@@ -42,8 +49,13 @@ class BodyDataModule(LightningDataModule):
 
     @property
     @abstractmethod
-    def body(self) -> BodyModel:
-        """The body that the data shows."""
+    def bodies(self) -> tuple[BodyModel, ...]:
+        """The bodies that the data shows, one for each gender."""
+
+    @property
+    def body_hash(self) -> str:
+        """The bodies' sorted hashes, joined by "-": see `SMPL.hash`."""
+        return "-".join(sorted(body.hash for body in self.bodies))
 
     @property
     @abstractmethod
@@ -60,5 +72,9 @@ class BodyDataModule(LightningDataModule):
         """The first training samples, and the depth images `(B, H, W)`, metres, that they were taken from."""
 
     @abstractmethod
-    def describe(self) -> dict[str, Any]:
-        """Source, fingerprint, sizes and the like: goes into records."""
+    def describe(self, splits: Sequence[str] = SPLITS) -> dict[str, Any]:
+        """Source, bodies, sizes, the hash of each split's poses and the like: goes into records.
+
+        Args:
+            splits: The splits that the run reads.
+        """

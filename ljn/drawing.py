@@ -3,16 +3,25 @@
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from ljn.body.skeleton import BONES
 from ljn.data import Batch
+from ljn.geometry.camera import Camera
+from ljn.render import get_renderer
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 _TRUE, _PREDICTED, _CLOUD = "#1f5fd6", "#d62728", "#b9bec6"
+SKIN = (0.80, 0.72, 0.66)
+_LIGHT = np.array(
+    [-0.25, -0.35, -0.90]
+)  # towards the light: camera frame, from behind the camera's left shoulder
+_FROM_THE_SIDE = np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
+"""The camera's axes turned about the vertical, so that what is far lies to the right."""
 
 
 def new_figure(width: float, height: float) -> "Figure":
@@ -89,6 +98,125 @@ def _draw_view(axis: "Axes", sample: Sample, horizontal: int) -> None:
     axis.set_xlim(centre[horizontal] - half, centre[horizontal] + half)
     axis.set_ylim(centre[1] + half, centre[1] - half)  # y points down
     axis.set_aspect("equal")
+
+
+class MeshSample(NamedTuple):
+    """What is drawn of a mesh regressor's sample; camera frame, metres.
+
+    Attributes:
+        points: `(N, 3)`.
+        vertices: `(V, 3)`, the truth.
+        pred_vertices: `(V, 3)`.
+        title: Text above it.
+    """
+
+    points: np.ndarray
+    vertices: np.ndarray
+    pred_vertices: np.ndarray
+    title: str
+
+
+def draw_meshes(samples: list[MeshSample], faces: np.ndarray, num_columns: int) -> "Figure":
+    """A page of samples (Fig. 3.13): predicted (red) beside true (blue) mesh, front and side, the cloud over them.
+
+    Args:
+        samples: What to draw, in reading order.
+        faces: `(F, 3)`, vertex indices.
+        num_columns: Samples in a row.
+
+    Returns:
+        A matplotlib figure.
+    """
+    num_rows = -(-len(samples) // num_columns)
+    figure = new_figure(6.0 * num_columns, 2.3 * num_rows)
+    axes = figure.subplots(num_rows, 4 * num_columns, squeeze=False)
+    for axis in axes.flat:
+        axis.set_axis_off()
+    for number, sample in enumerate(samples):
+        row, column = divmod(number, num_columns)
+        middle = (sample.vertices.min(0) + sample.vertices.max(0)) / 2
+        size_m = 1.1 * float(np.ptp(np.concatenate([sample.vertices, sample.pred_vertices]), axis=0).max())
+        panels = [
+            (view, vertices, colour)
+            for view in (np.eye(3), _FROM_THE_SIDE)
+            for vertices, colour in (
+                (sample.pred_vertices, (0.90, 0.55, 0.50)),
+                (sample.vertices, (0.55, 0.68, 0.92)),
+            )
+        ]
+        for axis, (view, vertices, colour) in zip(axes[row, 4 * column :], panels):
+            _draw_mesh_view(axis, (vertices - middle) @ view.T, faces, size_m, colour)
+            _draw_cloud_over(axis, (sample.points - middle) @ view.T, size_m)
+        axes[row, 4 * column].set_title(sample.title, fontsize=9, loc="left")
+    return figure
+
+
+_PANEL_PX = 220
+_PANEL_DISTANCE_M = 4.0
+
+
+def _panel_camera(size_m: float) -> Camera:
+    focal = _PANEL_PX / size_m * _PANEL_DISTANCE_M
+    centre = (_PANEL_PX - 1) / 2
+    return Camera(focal, focal, centre, centre, _PANEL_PX, _PANEL_PX)
+
+
+def _draw_mesh_view(
+    axis: "Axes", vertices: np.ndarray, faces: np.ndarray, size_m: float, colour: tuple[float, float, float]
+) -> None:
+    seen = vertices + [0, 0, _PANEL_DISTANCE_M]
+    axis.imshow(shade_mesh(seen, faces, _panel_camera(size_m), colour))
+
+
+def _draw_cloud_over(axis: "Axes", points: np.ndarray, size_m: float) -> None:
+    camera = _panel_camera(size_m)
+    seen = points + [0, 0, _PANEL_DISTANCE_M]
+    axis.scatter(
+        camera.fx * seen[:, 0] / seen[:, 2] + camera.cx,
+        camera.fy * seen[:, 1] / seen[:, 2] + camera.cy,
+        s=0.4,
+        c="black",
+        alpha=0.25,
+        linewidths=0,
+    )
+
+
+def shade_mesh(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    camera: Camera,
+    colour: tuple[float, float, float] | np.ndarray = SKIN,
+    background: float | np.ndarray = 1.0,
+) -> np.ndarray:
+    """A picture of a mesh, smoothly shaded.
+
+    Args:
+        vertices: `(V, 3)`, metres, camera frame, in front of the camera.
+        faces: `(F, 3)`, vertex indices, outwards counter-clockwise.
+        camera: The camera.
+        colour: RGB in 0-1, one or `(F, 3)`, one for each face.
+        background: What is seen beside the mesh: grey, or an image `(H, W, 3)`.
+
+    Returns:
+        `(H, W, 3)` RGB in 0-1.
+    """
+    corners = vertices[faces]
+    face_normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals = np.zeros((len(vertices), 3))
+    for corner in range(3):
+        np.add.at(normals, faces[:, corner], face_normals)
+    seen = get_renderer("zbuffer").fragments(
+        torch.from_numpy(np.ascontiguousarray(vertices, dtype=np.float64))[None],
+        torch.from_numpy(faces),
+        camera,
+    )
+    face_ids, shares = seen.face_ids[0].numpy(), seen.barycentrics[0].numpy()
+    normal = (normals[faces[face_ids]] * shares[..., None]).sum(-2)
+    normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
+    light = np.clip(normal @ (_LIGHT / np.linalg.norm(_LIGHT)), 0, 1)
+    albedo = np.broadcast_to(np.asarray(colour, np.float64), (len(faces), 3))[face_ids]
+    lit = albedo * (0.25 + 0.75 * light)[..., None]
+    return np.where((face_ids >= 0)[..., None], lit, background)
 
 
 def draw_examples(batch: Batch, depth: Tensor) -> "Figure":

@@ -7,7 +7,7 @@ import torch
 from datamodules.placement import draw_heading
 from datamodules.sources.embedded import EmbeddedSource
 from datamodules.synthetic import SyntheticDepthDataModule
-from ljn.body import SMPL, load_body_model
+from ljn.body import SMPL, load_body_model, load_body_models
 from ljn.geometry.camera import Camera
 from ljn.geometry.rotations import CAMERA_FROM_BODY, rotation_about, rotmat_to_rotvec, rotvec_to_rotmat
 from ljn.optional import import_open3d, import_pyrender
@@ -22,7 +22,14 @@ def kinect():
 
 @pytest.fixture(scope="session")
 def body():
+    """The neutral body."""
     return load_body_model()
+
+
+@pytest.fixture(scope="session")
+def body_models(source):
+    """A body for each gender that the source draws."""
+    return load_body_models(None, source.genders)
 
 
 @pytest.fixture(scope="session")
@@ -31,20 +38,21 @@ def source():
 
 
 @pytest.fixture(scope="session")
-def bodies(body, source):
+def bodies(body_models, source):
     """64 posed meshes `(64, V, 3)` with random headings, and their faces: metres, camera axes, at the origin."""
     records = source.records("train", 64, seed=5)
     rng = np.random.default_rng(5)
     pose = torch.from_numpy(records.pose).double()
     heading = torch.tensor([draw_heading("histogram", rng) for _ in range(64)], dtype=torch.float64)
     root = rotmat_to_rotvec(rotation_about("z", heading) @ rotvec_to_rotmat(pose[:, :3]))
-    layer = SMPL(body).double()
-    vertices = layer(torch.cat([root, pose[:, 3:]], -1), torch.from_numpy(records.betas).double()).vertices
+    layer = SMPL(body_models).double()
+    pose, betas = torch.cat([root, pose[:, 3:]], -1), torch.from_numpy(records.betas).double()
+    vertices = layer(pose, betas, torch.from_numpy(records.gender)).vertices
     return (vertices @ CAMERA_FROM_BODY.T).numpy(), layer.faces
 
 
 @pytest.fixture(scope="session")
-def make_datamodule(kinect, body, source, tmp_path_factory):
+def make_datamodule(kinect, body_models, source, tmp_path_factory):
     """Builds a small data module; each with a cache of its own unless `cache_dir` is given."""
     numbers = itertools.count()
 
@@ -66,7 +74,7 @@ def make_datamodule(kinect, body, source, tmp_path_factory):
             arguments["cache_dir"] = tmp_path_factory.mktemp(f"samples{next(numbers)}")
         datamodule = SyntheticDepthDataModule(**{**arguments, **changes})
         if "body_path" not in changes:
-            datamodule._body = body  # read once for all
+            datamodule._bodies = body_models  # read once for all
         return datamodule
 
     return make

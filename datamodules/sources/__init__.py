@@ -1,13 +1,19 @@
 """Sources of poses. Each yields `PoseRecords` for a split; how they are rendered is not its concern."""
 
+import hashlib
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
 
 from ljn.body.skeleton import NUM_JOINTS
+from ljn.data import SPLITS
 
-SPLITS = ("train", "val", "test")
+__all__ = ["SPLITS", "PoseRecords", "PoseSource"]
+
+_HASH_STEP = 1e-5
 
 
 @dataclass(frozen=True)
@@ -19,8 +25,8 @@ class PoseRecords:
             x forward), heading included where `has_heading`.
         betas: `(R, 10)` float32 shape coefficients.
         gender: `(R,)` int64, codes of `ljn.body.GENDERS`.
-        sequence: `(R,)` str, the clip that the pose came from.
-        frame: `(R,)` int64, the frame in that clip.
+        sequence: `(R,)` str, the clip that the pose came from, or what it was made of.
+        frame: `(R,)` int64, the frame in that clip; -1 where there is none.
         has_heading: Whether the first rotation still holds the heading that was recorded.
     """
 
@@ -50,6 +56,21 @@ class PoseRecords:
     def __len__(self) -> int:
         return len(self.pose)
 
+    @cached_property
+    def hash(self) -> str:
+        """Name of the table's content: the first 16 hex digits of a SHA-256 over all columns, row by row.
+
+        Pose and betas enter as whole numbers of steps of 1e-5 (radians; standard deviations). Rounding, which differs
+        between machines, does not change it, unless a value lies just between two steps.
+        """
+        digest = hashlib.sha256(f"{len(self)} {self.has_heading}".encode())
+        for values in (self.pose, self.betas):
+            digest.update(np.rint(values.astype(np.float64) / _HASH_STEP).astype("<i8").tobytes())
+        for codes in (self.gender, self.frame):
+            digest.update(codes.astype("<i8").tobytes())
+        digest.update("\n".join(self.sequence.tolist()).encode())
+        return digest.hexdigest()[:16]
+
 
 class PoseSource(Protocol):
     """What a source of poses offers."""
@@ -67,6 +88,11 @@ class PoseSource(Protocol):
     @property
     def licence(self) -> str:
         """One line on where the poses come from and what may be done with them."""
+        ...
+
+    @property
+    def genders(self) -> Sequence[str]:
+        """The genders that its records may have, keys of `ljn.body.GENDERS`: a body is loaded for each."""
         ...
 
     def check(self) -> None:

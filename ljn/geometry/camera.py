@@ -6,6 +6,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from ljn.geometry.rotations import CAMERA_FROM_BODY
+
 
 @dataclass(frozen=True)
 class Camera:
@@ -69,3 +71,18 @@ def back_project(pixels: Tensor, depth: Tensor, intrinsics: Tensor) -> Tensor:
     focal, centre = intrinsics[..., None, :2], intrinsics[..., None, 2:]
     depth = depth[..., None]
     return torch.cat([(pixels - centre) / focal * depth, depth], -1)
+
+
+def place_at_root(points: Tensor, root: Tensor, camera_root: Tensor) -> Tensor:
+    """Points of a body before the camera: R M + T' of Eq. 4.1, where T' (Eq. 4.2) takes the root where it is seen.
+
+    Args:
+        points: `(..., N, 3)`, vertices or joints, metres, body world.
+        root: `(..., 3)`, the body's root joint, metres, body world.
+        camera_root: `(..., 3)`, the root joint in the camera frame, metres.
+
+    Returns:
+        `(..., N, 3)`, metres, camera frame.
+    """
+    cam_from_body = CAMERA_FROM_BODY.to(points)
+    return (points - root[..., None, :]) @ cam_from_body.T + camera_root[..., None, :]

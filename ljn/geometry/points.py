@@ -100,7 +100,8 @@ def _ball_group_on_cpu(points: Tensor, centres: Tensor, radii: Tensor, group_siz
 
     group = torch.empty(*centres.shape[:2], group_size, dtype=torch.int64)
     columns = (points.detach(), centres.detach().to(points), radii.detach().to(points).square())
-    kernels.ball_group(*(column.contiguous().numpy() for column in columns), group.numpy())
+    arrays = [column.contiguous().numpy() for column in columns]
+    kernels.ball_group(arrays[0], arrays[1], arrays[2], group.numpy())
     is_empty = group[..., 0] < 0
     if is_empty.any():
         sample, centre = is_empty.nonzero(as_tuple=True)

@@ -72,6 +72,22 @@ def rotmat_to_rotvec(rotmat: Tensor) -> Tensor:
     return scale * imaginary
 
 
+def rot6d_to_rotmat(rot6d: Tensor) -> Tensor:
+    """Rotation matrices from their first two columns, made orthonormal (Zhou et al. 2019).
+
+    Args:
+        rot6d: `(..., 6)`: first column, then second; any length, not parallel.
+
+    Returns:
+        `(..., 3, 3)`.
+    """
+    _check_shape("rot6d", rot6d, (6,))
+    first, second = rot6d.unflatten(-1, (2, 3)).unbind(-2)
+    x = torch.nn.functional.normalize(first, dim=-1)
+    y = torch.nn.functional.normalize(second - (x * second).sum(-1, keepdim=True) * x, dim=-1)
+    return torch.stack([x, y, torch.linalg.cross(x, y)], -1)
+
+
 def rotation_about(axis: str, angle: Tensor) -> Tensor:
     """Rotation matrices about a coordinate axis.
 
@@ -86,6 +102,89 @@ def rotation_about(axis: str, angle: Tensor) -> Tensor:
         raise ValueError(f"axis: expected 'x', 'y' or 'z', got {axis!r}")
     unit = torch.eye(3, dtype=angle.dtype, device=angle.device)["xyz".index(axis)]
     return rotvec_to_rotmat(angle[..., None] * unit)
+
+
+def euler_to_rotmat(axes: str, angles: Tensor) -> Tensor:
+    """Rotation matrices from angles about three different coordinate axes.
+
+    Args:
+        axes: The axes in the order of the product, such as "xzy": R = R_x(a) R_z(b) R_y(c); every turn is about
+            the axis as the turns before it have left it.
+        angles: `(..., 3)`, radians, in the order of `axes`.
+
+    Returns:
+        `(..., 3, 3)`, acting on column vectors.
+    """
+    _check_axes(axes)
+    _check_shape("angles", angles, (3,))
+    i, j, k = ("xyz".index(axis) for axis in axes)
+    sign = 1.0 if (j - i) % 3 == 1 else -1.0
+    (ca, cb, cc), (sa, sb, sc) = angles.cos().unbind(-1), (sign * angles.sin()).unbind(-1)
+    entries = {
+        (i, i): cb * cc, (i, j): -cb * sc, (i, k): sb,
+        (j, i): ca * sc + sa * sb * cc, (j, j): ca * cc - sa * sb * sc, (j, k): -sa * cb,
+        (k, i): sa * sc - ca * sb * cc, (k, j): sa * cc + ca * sb * sc, (k, k): ca * cb,
+    }  # fmt: skip
+    return torch.stack([entries[row, column] for row in range(3) for column in range(3)], -1).unflatten(
+        -1, (3, 3)
+    )
+
+
+def rotmat_to_euler(axes: str, rotmat: Tensor) -> Tensor:
+    """Angles about three different coordinate axes: the inverse of `euler_to_rotmat`.
+
+    Args:
+        axes: The axes in the order of the product; see `euler_to_rotmat`.
+        rotmat: `(..., 3, 3)` rotation matrices.
+
+    Returns:
+        `(..., 3)`, radians; the second lies in [-pi/2, pi/2], and where it reaches an end only the sum or the
+        difference of the other two is determined.
+    """
+    _check_axes(axes)
+    _check_shape("rotmat", rotmat, (3, 3))
+    i, j, k = ("xyz".index(axis) for axis in axes)
+    sign = 1.0 if (j - i) % 3 == 1 else -1.0
+    first = torch.atan2(-sign * rotmat[..., j, k], rotmat[..., k, k])
+    cosine = torch.hypot(rotmat[..., i, i], rotmat[..., i, j])
+    second = torch.atan2(sign * rotmat[..., i, k], cosine)
+    third = torch.atan2(-sign * rotmat[..., i, j], rotmat[..., i, i])
+    return torch.stack([first, second, third], -1)
+
+
+def swing_twist(rotmat: Tensor, axis: Tensor) -> tuple[Tensor, Tensor]:
+    """Splits rotations into a turn about an axis and the shortest rotation that then brings the axis to its place.
+
+    Args:
+        rotmat: `(..., 3, 3)` rotation matrices.
+        axis: `(..., 3)` unit vectors.
+
+    Returns:
+        The swing `(..., 3, 3)` and the angle of the twist `(...)`, radians in [-pi, pi]: R = swing R_axis(twist).
+        Where R turns the axis round to its opposite, the split is not determined.
+    """
+    _check_shape("rotmat", rotmat, (3, 3))
+    _check_shape("axis", axis, (3,))
+    rotvec = rotmat_to_rotvec(rotmat)
+    # Half the rotation vector has the direction of the quaternion's imaginary part and its angle.
+    half = rotvec.norm(dim=-1, keepdim=True) / 2
+    along = (rotvec * axis).sum(-1) / 2 * torch.sinc(half / torch.pi).squeeze(-1)
+    twist = 2 * torch.atan2(along, half.cos().squeeze(-1))
+    return rotmat @ rotvec_to_rotmat(-twist[..., None] * axis), twist
+
+
+def interpolate_rotmat(start: Tensor, end: Tensor, share: Tensor) -> Tensor:
+    """Rotations on the shortest way from `start` to `end` (spherical linear interpolation).
+
+    Args:
+        start: `(..., 3, 3)` rotation matrices.
+        end: `(..., 3, 3)` rotation matrices.
+        share: `(...)`, how far to go: 0 stays at `start`, 1 reaches `end`.
+
+    Returns:
+        `(..., 3, 3)`.
+    """
+    return start @ rotvec_to_rotmat(share[..., None] * rotmat_to_rotvec(start.mT @ end))
 
 
 def smpl_pose_to_body_world(pose: Tensor) -> Tensor:
@@ -118,6 +217,11 @@ def _turn_root(rotmat: Tensor, pose: Tensor) -> Tensor:
     _check_shape("pose", pose, (72,))
     root, others = pose.split([3, 69], dim=-1)
     return torch.cat([rotmat_to_rotvec(rotmat.to(pose) @ rotvec_to_rotmat(root)), others], dim=-1)
+
+
+def _check_axes(axes: str) -> None:
+    if sorted(axes) != ["x", "y", "z"]:
+        raise ValueError(f"axes: expected 'x', 'y' and 'z' in some order, got {axes!r}")
 
 
 def _check_shape(name: str, value: Tensor, last: tuple[int, ...]) -> None:

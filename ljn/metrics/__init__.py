@@ -1,6 +1,9 @@
 """Metrics: functional forms for each sample, and torchmetrics classes that gather them."""
 
 from ljn.metrics.functional import (
+    apve,
+    apve_procrustes,
+    apve_root_aligned,
     joint_errors_mm,
     keypoint_distances_px,
     mpjpe,
@@ -8,6 +11,7 @@ from ljn.metrics.functional import (
     mpjpe_procrustes,
     mpjpe_root_aligned,
     pckh,
+    pckh_root_aligned,
     pckh_threshold_mm,
 )
 from ljn.metrics.joints import (
@@ -20,22 +24,41 @@ from ljn.metrics.joints import (
     PCKhThreshold,
     ProcrustesMPJPE,
     RootAlignedMPJPE,
+    RootAlignedPCKh,
     SampleMax,
     SampleMean,
 )
+from ljn.metrics.meshes import (
+    APVE,
+    MaxJointDistance,
+    MeanJointDistance,
+    MeshMetrics,
+    ProcrustesAPVE,
+    RootAlignedAPVE,
+)
 
 __all__ = [
+    "APVE",
     "MPJPE",
     "JointMetrics",
     "MPJPEEq38",
+    "MaxJointDistance",
     "MaxKeypointDistance",
+    "MeanJointDistance",
     "MeanKeypointDistance",
+    "MeshMetrics",
     "PCKh",
     "PCKhThreshold",
+    "ProcrustesAPVE",
     "ProcrustesMPJPE",
+    "RootAlignedAPVE",
     "RootAlignedMPJPE",
+    "RootAlignedPCKh",
     "SampleMax",
     "SampleMean",
+    "apve",
+    "apve_procrustes",
+    "apve_root_aligned",
     "joint_errors_mm",
     "keypoint_distances_px",
     "mpjpe",
@@ -43,5 +66,6 @@ __all__ = [
     "mpjpe_procrustes",
     "mpjpe_root_aligned",
     "pckh",
+    "pckh_root_aligned",
     "pckh_threshold_mm",
 ]

@@ -109,6 +109,60 @@ def pckh(pred: Tensor, target: Tensor) -> Tensor:
     return 100.0 * correct.where(~errors.isnan(), errors).mean(-1)
 
 
+def pckh_root_aligned(pred: Tensor, target: Tensor) -> Tensor:
+    """Return PCKh@0.5 after moving both roots to the origin (the root is always correct).
+
+    Args:
+        pred: `(..., 24, 3)`, metres.
+        target: `(..., 24, 3)`, metres, the same axes.
+
+    Returns:
+        `(...)`, %, float64.
+    """
+    return pckh(root_align(pred.double(), ROOT), root_align(target.double(), ROOT))
+
+
+def apve(pred: Tensor, target: Tensor) -> Tensor:
+    """Return Eq. 3.9, the mean distance of the predicted vertices from the true ones (also called PVE).
+
+    Args:
+        pred: `(..., V, 3)`, metres.
+        target: `(..., V, 3)`, metres, the same frame.
+
+    Returns:
+        `(...)`, mm, float64.
+    """
+    return joint_errors_mm(pred, target).mean(-1)
+
+
+def apve_root_aligned(pred: Tensor, target: Tensor, pred_root: Tensor, target_root: Tensor) -> Tensor:
+    """Return the mean error over all vertices after moving both root joints to the origin.
+
+    Args:
+        pred: `(..., V, 3)`, metres.
+        target: `(..., V, 3)`, metres, the same axes.
+        pred_root: `(..., 3)`, metres, of the predicted body.
+        target_root: `(..., 3)`, metres, of the true one.
+
+    Returns:
+        `(...)`, mm, float64.
+    """
+    return apve(pred.double() - pred_root[..., None, :], target.double() - target_root[..., None, :])
+
+
+def apve_procrustes(pred: Tensor, target: Tensor) -> Tensor:
+    """Return the mean error over all vertices after the best rotation, scale and translation of `pred`.
+
+    Args:
+        pred: `(..., V, 3)`, metres.
+        target: `(..., V, 3)`, metres.
+
+    Returns:
+        `(...)`, mm, float64.
+    """
+    return apve(procrustes_align(pred.double(), target), target)
+
+
 def keypoint_distances_px(noisy: Tensor, clean: Tensor) -> Tensor:
     """Return how far the noise has moved each 2D keypoint.
 

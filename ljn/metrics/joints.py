@@ -100,6 +100,13 @@ class PCKh(SampleMean):
     formula = staticmethod(functional.pckh)
 
 
+class RootAlignedPCKh(SampleMean):
+    """PCKh@0.5 with the roots made to coincide, %; see `functional.pckh_root_aligned`."""
+
+    higher_is_better = True
+    formula = staticmethod(functional.pckh_root_aligned)
+
+
 class PCKhThreshold(SampleMean):
     """Mean threshold of PCKh@0.5, mm, from the true joints alone; see `functional.pckh_threshold_mm`."""
 
@@ -129,6 +136,7 @@ class JointMetrics(MetricCollection):
     | `mpjpe_root_aligned`       | mm   | predicted joints               |
     | `mpjpe_procrustes`         | mm   | predicted joints               |
     | `pckh`                     | %    | predicted joints, camera frame |
+    | `pckh_root_aligned`        | %    | predicted joints               |
     | `pckh_threshold_mm`        | mm   | true joints                    |
     | `initial_mpjpe`            | mm   | initial joints, camera frame   |
     | `initial_mean_distance_px` | px   | noisy keypoints                |
@@ -146,6 +154,7 @@ class JointMetrics(MetricCollection):
                 "mpjpe_root_aligned": RootAlignedMPJPE(),
                 "mpjpe_procrustes": ProcrustesMPJPE(),
                 "pckh": PCKh(),
+                "pckh_root_aligned": RootAlignedPCKh(),
                 "pckh_threshold_mm": PCKhThreshold(),
                 "initial_mpjpe": MPJPE(),
                 "initial_mean_distance_px": MeanKeypointDistance(),

@@ -39,6 +39,7 @@ class PointNet(nn.Module):
         self.local = perceptron([in_channels, *local_channels])
         self.lift = perceptron([local_channels[-1], *global_channels], last_activation=False)
         self.lift_activation = nn.PReLU()
+        self.out_channels = global_channels[-1]
 
     def forward(self, points: Tensor) -> PointFeatures:
         """`(B, N, in_channels)` -> `PointFeatures`; the global feature ignores the order of the points."""

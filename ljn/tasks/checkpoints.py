@@ -12,16 +12,20 @@ from typing import Any
 import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.plugins.io import TorchCheckpointIO
+from omegaconf import OmegaConf
 from torch import Tensor
 
-CHECKPOINT_VERSION = 1
+from ljn.modules.base import StageModule
+from ljn.tasks.building import build
+
+CHECKPOINT_VERSION = 2
 _PROVENANCE_KEY = "ljn"
 # What a damaged file makes PyTorch, pickle and zipfile raise.
 _READ_ERRORS = (
     AttributeError, EOFError, LookupError, OSError, RuntimeError, TypeError, ValueError, pickle.UnpicklingError,
     zipfile.BadZipFile,
 )  # fmt: skip
-CONFIG_GROUPS = ("preset", "model", "module", "data", "body", "trainer", "seed", "name")
+CONFIG_GROUPS = ("preset", "model", "module", "data", "body", "trainer", "seed", "name", "optimized_metric")
 """The part of a stored configuration that decides what a checkpoint is."""
 
 
@@ -30,7 +34,7 @@ class Provenance(Callback):
 
     Args:
         config: The resolved configuration, plain values.
-        body_hash: The body's hash.
+        body_hash: See `BodyDataModule.body_hash`.
         data_licence: What is to be said of the data's licence.
         run: Name of the run's directory.
     """
@@ -78,7 +82,7 @@ class Checkpoint:
     Attributes:
         path: The file.
         config: The resolved configuration that the model was trained with.
-        body_hash: Hash of the body that its data showed.
+        body_hash: Hashes of the bodies that its data showed, joined by "-".
         data_licence: What is said of the data's licence.
         run: Name of the directory of the training run.
         epoch: Epochs completed when it was written.
@@ -122,10 +126,16 @@ def read_checkpoint(path: str | Path) -> Checkpoint:
             f"ckpt_path: '{path}' is a PyTorch file, but no checkpoint that a run of this library wrote: it "
             "carries no whole configuration"
         )
-    if provenance["version"] > CHECKPOINT_VERSION:
+    if provenance["version"] != CHECKPOINT_VERSION:
+        newer = provenance["version"] > CHECKPOINT_VERSION
         raise ValueError(
-            f"ckpt_path: '{path}' was written by a newer version of this library (checkpoint version "
-            f"{provenance['version']}, known up to {CHECKPOINT_VERSION}); update the library"
+            f"ckpt_path: '{path}' was written by {'a newer' if newer else 'an older'} version of this library "
+            f"(checkpoint version {provenance['version']}, this one reads {CHECKPOINT_VERSION}); "
+            + (
+                "update the library"
+                if newer
+                else "train it again, or evaluate it with the version it is from"
+            )
         )
     return Checkpoint(
         path=path,
@@ -178,3 +188,26 @@ def load_state(module: torch.nn.Module, checkpoint: Checkpoint) -> None:
             f"the first is '{name}', expected {expected.get(name, 'none')}, got {got.get(name, 'none')}"
         )
     module.load_state_dict(checkpoint.state)
+
+
+def load_module(path: str | Path, kind: type[StageModule], name: str = "ckpt_path") -> tuple[Any, Checkpoint]:
+    """The trained module of a checkpoint, in evaluation mode, and the checkpoint.
+
+    Args:
+        path: The file.
+        kind: What the module must be: `JointDetector` or `MeshRegressor`.
+        name: The argument to name in errors.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: See `read_checkpoint` and `load_state`; or the checkpoint is of another kind.
+    """
+    checkpoint = read_checkpoint(path)
+    module = build(OmegaConf.create(checkpoint.config["module"]))
+    if not isinstance(module, kind):
+        raise ValueError(
+            f"{name}: expected the checkpoint of a {kind.__name__}, but '{path}' is that of a "
+            f"{type(module).__name__} ({checkpoint.run}); have two checkpoints changed places?"
+        )
+    load_state(module, checkpoint)
+    return module.eval().requires_grad_(False), checkpoint

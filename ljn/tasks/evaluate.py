@@ -66,11 +66,6 @@ def evaluate(cfg: DictConfig) -> dict[str, float]:
 
     datamodule: BodyDataModule = build(cfg.data)
     datamodule.prepare_data()
-    if datamodule.body.hash != checkpoint.body_hash:
-        raise ValueError(
-            f"body: the checkpoint was trained with the body {checkpoint.body_hash}, this is "
-            f"{datamodule.body.hash}; a model is only meaningful with its body: name it with body.path=FILE"
-        )
     identity = {**records.identity(cfg, datamodule.fingerprint), "checkpoint": checkpoint.file_hash}
     identity_hash = records.config_hash(identity)
     run_dir = set_run_directory(cfg, "evaluations", identity_hash)
@@ -79,17 +74,18 @@ def evaluate(cfg: DictConfig) -> dict[str, float]:
     prepare_process(cfg)
     module = build(cfg.module)
     load_state(module, checkpoint)
+    _check_bodies(checkpoint, {body.hash for body in datamodule.bodies} | set(module.body_hashes))
     facts = {
         "name": cfg.name,
         "preset": cfg.preset.name,
         "config_hash": identity_hash,
         "trained_by": checkpoint.run,
         "checkpoint": {"path": str(checkpoint.path), "hash": checkpoint.file_hash, "epoch": checkpoint.epoch},
-        "data": datamodule.describe(),
+        "data": datamodule.describe(("test",)),
     }
     with records.RunRecord(run_dir, facts) as record:
         config = save_config(cfg, run_dir)
-        trainer = build_trainer(cfg, run_dir, config, datamodule)
+        trainer = build_trainer(cfg, run_dir, config, datamodule, module)
         record.add(device=str(trainer.strategy.root_device), num_threads=torch.get_num_threads())
         with tracking(trainer, identity_hash, config, trained_by=checkpoint.run):
             trainer.test(module, datamodule, verbose=False)
@@ -97,6 +93,15 @@ def evaluate(cfg: DictConfig) -> dict[str, float]:
         records.write_json(run_dir / "metrics.json", metrics)
     _LOG.info("%s on %s: %s", checkpoint.run, cfg.name, run_dir)
     return metrics
+
+
+def _check_bodies(checkpoint: Checkpoint, hashes: set[str]) -> None:
+    if unknown := sorted(hashes - set(checkpoint.body_hash.split("-"))):
+        raise ValueError(
+            f"body: the checkpoint was trained with the bodies {checkpoint.body_hash}; {unknown[0]} is not among "
+            "them. A model is only meaningful with its bodies: name them with body.path=FILE_OR_FOLDER and "
+            "body.genders"
+        )
 
 
 def with_checkpoint_config(cfg: DictConfig, checkpoint: Checkpoint, overrides: list[str]) -> DictConfig:
@@ -150,7 +155,14 @@ def _set(cfg: DictConfig, key: str, value: Any, line: str | None) -> None:
     OmegaConf.update(cfg, key, value)
     if key.startswith("body."):
         # The stored config is resolved: what was derived from the body's group has to follow by hand.
-        cfg.data[f"body_{key.removeprefix('body.')}"] = value
+        OmegaConf.update(
+            cfg, {"body.path": "data.body_path", "body.genders": "data.source.genders"}[key], value
+        )
 
 
+_OF_BODY = {
+    "body.path": ("data.body_path", "module.body_path"),
+    "body.genders": ("data.source.genders", "module.genders"),
+    "body.predicted": ("module.predicted",),
+}
 _MISSING = object()

@@ -25,7 +25,8 @@ RECORD_VERSION = 1
 
 # What may differ between two runs that are the same run; what data files hold is in the data's fingerprint.
 _NOT_IDENTITY: dict[str, tuple[str, ...]] = {
-    "data": ("source", "cache_dir", "num_workers", "prefetch_batches", "body_path", "body_gender"),
+    "data": ("source", "cache_dir", "num_workers", "prefetch_batches", "body_path", "detector_ckpt"),
+    "module": ("body_path",),
     "trainer": ("accelerator", "devices", "enable_model_summary", "log_every_n_steps", "profiler"),
 }
 

@@ -18,6 +18,11 @@ class Config:
     ckpt_path: str | None = None
     rerun: bool = False
     optimized_metric: str = "val/mpjpe"
+    input: str | None = None
+    camera: str | None = None
+    keypoints: str | None = None
+    mask: str | None = None
+    mesh_ckpt_path: str | None = None
     task: Any = None
     preset: Any = None
     data: Any = None

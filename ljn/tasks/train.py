@@ -12,6 +12,7 @@ import torch
 from omegaconf import DictConfig, OmegaConf, open_dict
 
 from ljn.data import BodyDataModule
+from ljn.modules.base import StageModule
 from ljn.tasks import records
 from ljn.tasks.building import build, build_each
 from ljn.tasks.checkpoints import AtomicCheckpointIO, Provenance, read_checkpoint
@@ -72,7 +73,7 @@ def train(cfg: DictConfig) -> dict[str, float]:
     }
     with records.RunRecord(run_dir, facts) as record:
         config = save_config(cfg, run_dir)
-        trainer = build_trainer(cfg, run_dir, config, datamodule)
+        trainer = build_trainer(cfg, run_dir, config, datamodule, module)
         record.add(device=str(trainer.strategy.root_device), num_threads=torch.get_num_threads())
         _LOG.info(f"resuming from {last}" if resumes else f"training in {run_dir}")
         # The fixed sets first: what is wrong with them should not come up after the training.
@@ -117,10 +118,11 @@ def _num_cores() -> int:
 
 
 def build_trainer(
-    cfg: DictConfig, run_dir: Path, config: dict[str, Any], datamodule: BodyDataModule
+    cfg: DictConfig, run_dir: Path, config: dict[str, Any], datamodule: BodyDataModule, module: StageModule
 ) -> lightning.Trainer:
     """The trainer with its callbacks and loggers, writing below the run's directory."""
-    provenance = Provenance(config, datamodule.body.hash, datamodule.licence, run_dir.name)
+    body_hashes = {*datamodule.body_hash.split("-"), *module.body_hashes}
+    provenance = Provenance(config, "-".join(sorted(body_hashes)), datamodule.licence, run_dir.name)
     return build(
         cfg.trainer,
         default_root_dir=str(run_dir),

@@ -4,6 +4,7 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
+from hydra.utils import get_class
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
@@ -74,13 +75,17 @@ def _check_integers(plain: dict[str, Any]) -> None:
 
 
 def _check_monitors(plain: dict[str, Any]) -> None:
-    from ljn.metrics import JointMetrics
-
-    known = {f"val/{name}" for name in JointMetrics().keys(keep_base=True)} | {"train/loss"}
-    for name, node in (plain.get("callbacks") or {}).items():
-        monitor = (node or {}).get("monitor")
-        if monitor is not None and monitor not in known:
+    # The module says what it logs; its target has passed `check_targets`.
+    module: Any = get_class(plain["module"]["_target_"])
+    keys = list(module.metrics().keys(keep_base=True))
+    known = {f"val/{key}" for key in keys} | {"train/loss"}
+    monitored: dict[str, tuple[Any, set[str]]] = {
+        f"callbacks.{name}.monitor": ((node or {}).get("monitor"), known)
+        for name, node in (plain.get("callbacks") or {}).items()
+    }
+    monitored["optimized_metric"] = (plain["optimized_metric"], known | {f"test/{key}" for key in keys})
+    for name, (metric, choices) in monitored.items():
+        if metric is not None and metric not in choices:
             raise ValueError(
-                f"callbacks.{name}.monitor: no metric '{monitor}' is logged in training; choose one of "
-                f"{', '.join(sorted(known))}"
+                f"{name}: no metric '{metric}' is logged; choose one of {', '.join(sorted(choices))}"
             )

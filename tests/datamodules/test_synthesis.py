@@ -30,14 +30,14 @@ NOISY = ("points", "noisy_keypoints_2d", "initial_joints")
 
 
 @pytest.fixture(scope="module")
-def make(body, source, kinect):
+def make(body_models, source, kinect):
     """Builds a synthesizer of twelve embedded records; float64, as for the fixed sets, unless told otherwise."""
     records = source.records("val", 12, seed=2)
-    layers = {dtype: SMPL(body).to(dtype) for dtype in (torch.float32, torch.float64)}
+    layers = {dtype: SMPL(body_models).to(dtype) for dtype in (torch.float32, torch.float64)}
 
     def build(seed_key=(0, 0), dtype=torch.float64, records=records, **changes):
         settings = SynthesisSettings(**{"camera": kinect, "num_points": 64, **changes})
-        synthesizer = DepthSynthesizer(records, body, settings, seed_key, dtype)
+        synthesizer = DepthSynthesizer(records, body_models, settings, seed_key, dtype)
         synthesizer.__dict__["_smpl"] = layers[dtype]  # building it would take longer than all the rest
         return synthesizer
 
@@ -64,9 +64,9 @@ def upright_records(heading):
     )
 
 
-def meshes(body, batch):
+def meshes(body_models, batch):
     """Vertices `(B, V, 3)` in the camera frame, from the batch alone (Eq. 3.4)."""
-    output = SMPL(body).double()(batch["pose"].double(), batch["betas"].double())
+    output = SMPL(body_models).double()(batch["pose"].double(), batch["betas"].double(), batch["gender"])
     vertices, joints = (points @ CAMERA_FROM_BODY.T for points in output)
     return vertices + (batch["joints"].double() - joints)[:, ROOT, None]
 
@@ -184,16 +184,16 @@ def test_initial_joints_project_onto_the_noisy_keypoints(batch):
     )
 
 
-def test_initial_joints_lie_at_a_depth_of_the_body(batch, body):
-    depth, vertices = batch["initial_joints"][..., 2], meshes(body, batch)[..., 2]
+def test_initial_joints_lie_at_a_depth_of_the_body(batch, body_models):
+    depth, vertices = batch["initial_joints"][..., 2], meshes(body_models, batch)[..., 2]
     assert (depth > vertices.amin(1, keepdim=True) - 0.01).all()
     assert (depth < vertices.amax(1, keepdim=True) + 0.01).all()
 
 
-def test_points_lie_on_the_mesh_that_pose_shape_and_joints_describe(batch, body):
-    vertices = meshes(body, batch)
+def test_points_lie_on_the_mesh_that_pose_shape_and_joints_describe(batch, body_models):
+    vertices = meshes(body_models, batch)
     for mesh, points in zip(vertices, batch["points"]):
-        assert torch.cdist(points[:, :3].double(), mesh).amin(1).max() < 0.03
+        assert torch.cdist(points[:, :3].double(), mesh).amin(1).max() < 0.04
 
 
 def test_the_box_of_the_joints_holds_the_cloud_but_for_flesh(batch):
@@ -237,9 +237,9 @@ def test_a_turned_body_points_its_toes_where_its_heading_says(make, heading, axi
     assert sign * float(toes[axis]) > 0.1
 
 
-def test_the_heading_is_part_of_the_pose(make, batch, body):
+def test_the_heading_is_part_of_the_pose(make, batch, body_models):
     # `meshes` knows nothing of a heading: the joints agree with pose and shape alone.
-    output = SMPL(body).double()(batch["pose"].double(), batch["betas"].double())
+    output = SMPL(body_models).double()(batch["pose"].double(), batch["betas"].double(), batch["gender"])
     joints = output.joints @ CAMERA_FROM_BODY.T
     expected = batch["joints"].double() - batch["joints"].double()[:, ROOT, None]
     torch.testing.assert_close(joints - joints[:, ROOT, None], expected, atol=1e-5, rtol=0)
@@ -347,7 +347,10 @@ def test_poses_without_a_heading_of_their_own_cannot_keep_it(make):
     [
         ({"num_points": 0}, "num_points: expected at least 1, got 0"),
         ({"heading": "front"}, "heading: expected one of source, histogram, uniform, got 'front'"),
-        ({"renderer": "opengl"}, "renderer: expected one of auto, zbuffer, pyrender, open3d, got 'opengl'"),
+        (
+            {"renderer": "opengl"},
+            "renderer: expected one of auto, zbuffer, torch, pyrender, open3d, got 'opengl'",
+        ),
         ({"distance_m": (0.0, 2.0)}, "distance_m: expected 0 < nearest <= farthest"),
         ({"distance_m": (3.0, 2.0)}, "distance_m: expected 0 < nearest <= farthest"),
         ({"margin_px": -1.0}, "margin_px: expected a number of 0 or more, got -1"),

@@ -4,7 +4,7 @@ import math
 import pytest
 import torch
 
-from ljn.geometry.camera import Camera, back_project, project
+from ljn.geometry.camera import Camera, back_project, place_at_root, project
 
 
 def draw_points(*shape, seed=0):
@@ -103,3 +103,19 @@ def test_the_principal_point_must_lie_inside_the_image(kinect, change):
 def test_swapped_width_and_height_are_named_as_the_likely_mistake():
     with pytest.raises(ValueError, match="are width and height, or cx and cy, swapped"):
         Camera(fx=365.0, fy=365.0, cx=260.0, cy=100.0, width=200, height=300)
+
+
+# Placement
+
+
+def test_a_body_is_placed_with_its_root_where_it_is_seen():
+    generator = torch.Generator().manual_seed(0)
+    points = torch.randn(2, 5, 3, generator=generator, dtype=torch.float64)
+    root, seen = torch.randn(2, 2, 3, generator=generator, dtype=torch.float64)
+    placed = place_at_root(points, root, seen)
+    torch.testing.assert_close(place_at_root(root[:, None], root, seen)[:, 0], seen)
+    for b in range(2):
+        for n in range(5):
+            forward, left, up = (points[b, n] - root[b]).tolist()
+            expected = seen[b] + torch.tensor([left, -up, -forward], dtype=torch.float64)
+            torch.testing.assert_close(placed[b, n], expected)

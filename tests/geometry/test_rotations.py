@@ -9,10 +9,15 @@ from ljn.geometry.rotations import (
     BODY_TO_OPENGL,
     CAMERA_FROM_BODY,
     body_world_pose_to_smpl,
+    euler_to_rotmat,
+    interpolate_rotmat,
+    rot6d_to_rotmat,
     rotation_about,
+    rotmat_to_euler,
     rotmat_to_rotvec,
     rotvec_to_rotmat,
     smpl_pose_to_body_world,
+    swing_twist,
 )
 
 DTYPE = torch.float64
@@ -87,6 +92,51 @@ def test_rotation_about_an_axis_equals_scipy(axis):
     np.testing.assert_allclose(rotation_about(axis, angle), expected, atol=1e-15)
 
 
+@pytest.mark.parametrize("axes", ["xyz", "xzy", "yxz", "yzx", "zxy", "zyx"])
+def test_euler_angles_equal_scipy_and_come_back(axes):
+    angles = torch.empty(200, 3, dtype=DTYPE).uniform_(-1, 1, generator=torch.Generator().manual_seed(0))
+    angles = angles * torch.tensor([math.pi, 1.57, math.pi])
+    rotmat = euler_to_rotmat(axes, angles)
+    expected = Rotation.from_euler(axes.upper(), angles.numpy()).as_matrix()
+    np.testing.assert_allclose(rotmat, expected, atol=1e-14)
+    torch.testing.assert_close(rotmat_to_euler(axes, rotmat), angles, atol=1e-12, rtol=0)
+
+
+def test_euler_angles_where_two_axes_meet_still_give_the_rotation():
+    angles = torch.tensor([[0.4, math.pi / 2, 0.3], [0.4, -math.pi / 2, 0.3]], dtype=DTYPE)
+    rotmat = euler_to_rotmat("zyx", angles)
+    again = rotmat_to_euler("zyx", rotmat)
+    assert again.isfinite().all()
+    torch.testing.assert_close(again[:, 1], angles[:, 1], atol=1e-7, rtol=0)
+
+
+def test_twist_and_swing_give_the_rotation_and_the_swing_is_the_shortest():
+    rotmat = rotvec_to_rotmat(random_rotvecs(300, scale=1.2))
+    axis = torch.nn.functional.normalize(random_rotvecs(300).flip(0), dim=-1)
+    swing, twist = swing_twist(rotmat, axis)
+    torch.testing.assert_close(swing @ rotvec_to_rotmat(twist[:, None] * axis), rotmat)
+    torch.testing.assert_close((rotmat_to_rotvec(swing) * axis).sum(-1), torch.zeros(300, dtype=DTYPE))
+    moved = (rotmat @ axis[..., None]).squeeze(-1)
+    between = (axis * moved).sum(-1).clamp(-1, 1).arccos()
+    torch.testing.assert_close(rotmat_to_rotvec(swing).norm(dim=-1), between, atol=1e-7, rtol=0)
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 1.0, -2.0, 3.1])
+def test_a_turn_about_the_axis_is_all_twist(angle):
+    angle = torch.tensor(angle, dtype=DTYPE)
+    swing, twist = swing_twist(rotation_about("y", angle), torch.tensor([0, 1, 0], dtype=DTYPE))
+    torch.testing.assert_close(twist, angle)
+    torch.testing.assert_close(swing, torch.eye(3, dtype=DTYPE))
+
+
+def test_interpolation_goes_the_shortest_way_at_an_even_pace():
+    start, end = rotvec_to_rotmat(random_rotvecs(2, 50, scale=1.0))
+    whole = rotmat_to_rotvec(start.mT @ end)
+    for share in (0.0, 0.3, 1.0):
+        middle = interpolate_rotmat(start, end, torch.full((50,), share, dtype=DTYPE))
+        torch.testing.assert_close(rotmat_to_rotvec(start.mT @ middle), share * whole, atol=1e-12, rtol=0)
+
+
 def test_body_axes_reach_opengl_and_opencv_cameras():
     forward, left, up = torch.eye(3, dtype=DTYPE)
     torch.testing.assert_close(
@@ -131,6 +181,33 @@ def test_a_wrong_shape_is_named(function, shape, message):
         function(torch.zeros(shape))
 
 
+@pytest.mark.parametrize("axes", ["xyx", "xy", "abc", "xyzx"])
+def test_axes_that_are_no_order_of_the_three_are_named(axes):
+    for function, shape in ((euler_to_rotmat, (3,)), (rotmat_to_euler, (3, 3))):
+        with pytest.raises(ValueError, match=f"axes: expected 'x', 'y' and 'z' in some order, got '{axes}'"):
+            function(axes, torch.zeros(shape))
+
+
 def test_an_unknown_axis_is_named():
     with pytest.raises(ValueError, match="axis: expected 'x', 'y' or 'z', got 'w'"):
         rotation_about("w", torch.zeros(()))
+
+
+# Two columns
+
+
+def test_two_columns_of_a_rotation_give_it_back():
+    rotmat = rotvec_to_rotmat(
+        torch.randn(20, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(4))
+    )
+    columns = rotmat[..., :2].mT.flatten(-2)
+    torch.testing.assert_close(rot6d_to_rotmat(columns), rotmat)
+    # Neither their lengths nor what the second has of the first matter.
+    columns[:, 3:] = 2 * columns[:, 3:] + 0.5 * columns[:, :3]
+    columns[:, :3] *= 3
+    torch.testing.assert_close(rot6d_to_rotmat(columns), rotmat)
+
+
+def test_rot6d_passes_gradcheck():
+    rot6d = torch.randn(3, 6, dtype=torch.float64, generator=torch.Generator().manual_seed(5))
+    assert torch.autograd.gradcheck(rot6d_to_rotmat, (rot6d.requires_grad_(),))

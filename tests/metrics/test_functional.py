@@ -203,3 +203,15 @@ def test_keypoints_must_be_two_dimensional_and_match():
         functional.keypoint_distances_px(torch.zeros(2, 24, 3), torch.zeros(2, 24, 3))
     with pytest.raises(ValueError, match="same shape"):
         functional.keypoint_distances_px(torch.zeros(2, 24, 2), torch.zeros(24, 2))
+
+
+def test_root_aligned_pckh_forgives_a_common_shift_and_nothing_else():
+    generator = torch.Generator().manual_seed(3)
+    target = torch.randn(5, 24, 3, generator=generator, dtype=torch.float64)
+    pred = target + 0.5 * torch.randn(5, 24, 3, generator=generator, dtype=torch.float64)
+    shifted = pred + torch.tensor([0.7, -3.0, 0.2], dtype=torch.float64)
+    aligned = pred - pred[:, :1] + target[:, :1]
+    torch.testing.assert_close(
+        functional.pckh_root_aligned(shifted, target), functional.pckh(aligned, target)
+    )
+    assert functional.pckh(aligned, target).min() < 100

@@ -17,6 +17,7 @@ KEYS = {
     "mpjpe_root_aligned",
     "mpjpe_procrustes",
     "pckh",
+    "pckh_root_aligned",
     "pckh_threshold_mm",
     "initial_mpjpe",
     "initial_mean_distance_px",
@@ -28,6 +29,7 @@ JOINT_METRICS = {
     "RootAlignedMPJPE": functional.mpjpe_root_aligned,
     "ProcrustesMPJPE": functional.mpjpe_procrustes,
     "PCKh": functional.pckh,
+    "RootAlignedPCKh": functional.pckh_root_aligned,
 }
 NUM_SAMPLES = 13
 
@@ -70,6 +72,7 @@ def test_joint_metrics_are_the_means_and_maximum_of_the_functional_forms():
         "mpjpe_root_aligned": functional.mpjpe_root_aligned(pred, joints).mean(),
         "mpjpe_procrustes": functional.mpjpe_procrustes(pred, joints).mean(),
         "pckh": functional.pckh(pred, joints).mean(),
+        "pckh_root_aligned": functional.pckh_root_aligned(pred, joints).mean(),
         "pckh_threshold_mm": functional.pckh_threshold_mm(joints).mean(),
         "initial_mpjpe": functional.mpjpe(initial, joints).mean(),
         "initial_mean_distance_px": distances.mean(),
@@ -137,6 +140,7 @@ def test_one_nan_prediction_makes_every_score_of_the_prediction_nan():
         "mpjpe_root_aligned",
         "mpjpe_procrustes",
         "pckh",
+        "pckh_root_aligned",
     }
 
 

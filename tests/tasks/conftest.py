@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
 
 from ljn.tasks.schema import register
 
@@ -71,3 +72,26 @@ def trained(smoke_config, tmp_path_factory):
     cfg = smoke_config(directory, "experiment=detector/proposed")
     metrics = train(cfg)
     return metrics, Path(cfg.paths.run_dir)
+
+
+@pytest.fixture(scope="session")
+def checkpoints(smoke_config, tmp_path_factory):
+    """Checkpoints of an untrained joint detector and an untrained mesh regressor, written as by a run."""
+    from ljn.body import load_body_models
+    from ljn.tasks.building import build
+    from ljn.tasks.checkpoints import Provenance
+
+    directory = tmp_path_factory.mktemp("checkpoints")
+    data_hashes = [body.hash for body in load_body_models(None, ["female", "male"])]
+    torch.manual_seed(0)
+    paths = []
+    for experiment in ("detector/proposed", "mesh/proposed"):
+        cfg = smoke_config(directory, f"experiment={experiment}", f"paths.run_dir={directory}")
+        module = build(cfg.module)
+        content = {"state_dict": module.state_dict(), "epoch": 0}
+        config = OmegaConf.to_container(cfg, resolve=True)
+        body_hash = "-".join(sorted({*data_hashes, *module.body_hashes}))
+        Provenance(config, body_hash, "none", experiment).on_save_checkpoint(None, module, content)
+        paths.append(directory / f"{experiment.split('/')[0]}.ckpt")
+        torch.save(content, paths[-1])
+    return paths

@@ -12,7 +12,7 @@ CONF = Path(__file__).parents[2] / "conf"
 GROUPS = sorted(
     f"{path.parent.relative_to(CONF)}={path.stem}"
     for path in CONF.rglob("*.yaml")
-    if path.parent != CONF and path.parts[-2] not in ("hydra", "local", "detector")
+    if path.parent != CONF and path.relative_to(CONF).parts[0] not in ("hydra", "local", "experiment")
 )
 EXPERIMENTS = sorted(
     f"experiment={path.relative_to(CONF / 'experiment').with_suffix('')}"
@@ -23,10 +23,17 @@ EXPERIMENTS = sorted(
 @pytest.mark.parametrize("choice", GROUPS + EXPERIMENTS)
 def test_every_config_composes_validates_and_builds(choice, compose_config, tmp_path):
     overrides = [choice, f"paths.output_dir={tmp_path}"]
-    if choice.startswith("model=") and choice.split("=")[1] in ("ridge", "mean_offset"):
-        overrides.append("module=yardstick")
-    if choice == "module=yardstick":
-        overrides.append("model=ridge")
+    partners = {
+        "model=ridge": "module=yardstick",
+        "model=mean_offset": "module=yardstick",
+        "model=body_network": "module=mesh_regressor",
+        "model=body_network_on_pointnet": "module=mesh_regressor",
+        "model=direct_body_network": "module=mesh_regressor",
+        "module=yardstick": "model=ridge",
+        "module=mesh_regressor": "model=body_network",
+    }
+    if choice in partners:
+        overrides.append(partners[choice])
     cfg = compose_config(*overrides, return_hydra_config=True)
     with open_dict(cfg):
         del cfg["hydra"]
@@ -35,6 +42,13 @@ def test_every_config_composes_validates_and_builds(choice, compose_config, tmp_
     build(cfg.data)
     build(cfg.module)
     build(cfg.trainer, logger=build_each(cfg.logger), callbacks=build_each(cfg.callbacks))
+
+
+def test_a_network_of_the_other_stage_is_refused(compose_config):
+    with pytest.raises(ValueError, match=r"net: a JointDetector takes a Detector, got a Hierarchical.*module="):
+        build(compose_config("model=body_network").module)
+    with pytest.raises(ValueError, match=r"net: a MeshRegressor takes a BodyNetwork, got a LocalJointNetwork"):
+        build(compose_config("module=mesh_regressor").module)
 
 
 def test_every_experiment_opens_with_the_command_that_runs_it():
@@ -66,7 +80,7 @@ def test_the_thesis_preset_holds_the_specs_numbers(compose_config):
     assert cfg.model.group_size == 128
     assert cfg.module.optimizer._target_ == "torch.optim.RAdam"
     assert (cfg.module.scheduler.step_size, cfg.module.scheduler.gamma) == (5, 0.1)
-    assert cfg.data.normals == "open3d"
+    assert cfg.data.normals == "knn"
 
 
 def test_a_misspelt_key_is_rejected(compose_config):

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 import torch
 
-from ljn.body.files import load_body_model
 from ljn.tasks.checkpoints import read_checkpoint
 from ljn.tasks.evaluate import evaluate, with_checkpoint_config
 
@@ -104,9 +103,10 @@ def test_an_incomplete_or_active_configuration_is_refused(edit, trained, smoke_c
         evaluate(evaluation(smoke_config, trained, tmp_path, ckpt_path=path))
 
 
-def test_a_newer_checkpoint_is_an_error(trained, smoke_config, tmp_path):
-    path = edited(trained, tmp_path, lambda content: content["ljn"].update(version=99))
-    with pytest.raises(ValueError, match="written by a newer version"):
+@pytest.mark.parametrize(("version", "age"), [(99, "a newer"), (0, "an older")])
+def test_a_checkpoint_of_another_version_is_an_error(version, age, trained, smoke_config, tmp_path):
+    path = edited(trained, tmp_path, lambda content: content["ljn"].update(version=version))
+    with pytest.raises(ValueError, match=f"written by {age} version"):
         evaluate(evaluation(smoke_config, trained, tmp_path, ckpt_path=path))
 
 
@@ -124,7 +124,7 @@ def test_code_named_by_a_checkpoint_is_refused(trained, smoke_config, tmp_path):
 
 def test_a_checkpoint_of_another_body_is_an_error(trained, smoke_config, tmp_path):
     path = edited(trained, tmp_path, lambda content: content["ljn"].update(body_hash="0123456789abcdef"))
-    with pytest.raises(ValueError, match=r"trained with the body 0123456789abcdef, this is .*body\.path"):
+    with pytest.raises(ValueError, match=r"trained with the bodies 0123456789abcdef; .*body\.path"):
         evaluate(evaluation(smoke_config, trained, tmp_path, ckpt_path=path))
 
 
@@ -146,24 +146,25 @@ def test_overrides_change_data_and_nothing_that_the_checkpoint_decides(trained, 
         with_checkpoint_config(cfg, checkpoint, ["data.num_pionts=3"])
 
 
-def test_the_body_can_be_given_as_another_file_with_the_same_content(trained, run_py, tmp_path):
-    body = load_body_model()
-    np.savez(
-        tmp_path / "copy.npz",
-        v_template=body.v_template,
-        shapedirs=body.shapedirs,
-        posedirs=body.posedirs,
-        J_regressor=body.J_regressor,
-        weights=body.weights,
-        f=body.faces,
-        kintree_table=np.load(body.path)["kintree_table"],
-    )
+def test_bodies_can_be_given_as_other_files_with_the_same_content(trained, run_py, body_models, tmp_path):
+    (tmp_path / "bodies").mkdir()
+    for body in body_models:
+        np.savez(
+            tmp_path / "bodies" / f"SMPL_{body.gender.upper()}.npz",
+            v_template=body.v_template,
+            shapedirs=body.shapedirs,
+            posedirs=body.posedirs,
+            J_regressor=body.J_regressor,
+            weights=body.weights,
+            f=body.faces,
+            kintree_table=np.load(body.path)["kintree_table"],
+        )
     done = run_py(
         *(
             "task=evaluate",
             f"ckpt_path={trained[1] / 'checkpoints' / 'best.ckpt'}",
             f"paths.output_dir={tmp_path}",
         ),
-        *(f"body.path={tmp_path / 'copy.npz'}", "logger=csv"),
+        *(f"body.path={tmp_path / 'bodies'}", "logger=csv"),
     )
     assert f"{trained[0]['test/mpjpe']:10.3f}" in done.stdout

@@ -23,6 +23,7 @@ NAMES = {
     "test/mpjpe_root_aligned",
     "test/mpjpe_procrustes",
     "test/pckh",
+    "test/pckh_root_aligned",
     "test/pckh_threshold_mm",
     "test/initial_mpjpe",
     "test/initial_mean_distance_px",
@@ -45,7 +46,8 @@ def test_a_run_leaves_its_files(trained):
     assert record["status"] == "complete"
     assert record["config_hash"] == run_dir.name.rpartition("-")[2]
     assert record["data"]["sizes"] == {"train": 32, "val": 16, "test": 16}
-    assert record["data"]["body"]["hash"]
+    assert set(record["data"]["bodies"]) == {"female", "male"}
+    assert set(record["data"]["pool"]) == {"train", "val", "test"}
     assert record["data"]["seeds"] == {"seed": 0, "pool_seed": 0, "eval_seed": 0}
     assert OmegaConf.load(run_dir / "config.yaml").data.num_points == 128
     assert (run_dir / "checkpoints" / "best.ckpt").is_file()

@@ -1,0 +1,105 @@
+"""What the two stages' LightningModules share: optimizer wiring, the check of the loss, logging of metrics."""
+
+from abc import abstractmethod
+from collections.abc import Callable
+from typing import Any, ClassVar
+
+import torch
+from lightning.pytorch import LightningModule
+from lightning.pytorch.utilities.types import OptimizerLRScheduler
+from torch import Tensor, nn
+from torch.optim import Optimizer
+from torch.optim.lr_scheduler import LRScheduler
+from torchmetrics import MetricCollection
+
+from ljn.data import Batch
+
+
+class StageModule(LightningModule):
+    """Base of the LightningModules: a network with its loss, optimizer and metrics.
+
+    Args:
+        net: The network.
+        optimizer: Makes the optimizer from the parameters; None for a module that is not trained here.
+        scheduler: Makes the learning-rate scheduler, stepped once an epoch, from the optimizer; None for none.
+
+    Raises:
+        ValueError: The network is not of this stage.
+    """
+
+    metrics: ClassVar[Callable[..., MetricCollection]]
+    """Makes a split's metrics; its keys are what may be monitored."""
+    takes: ClassVar[type[nn.Module]]
+    """What `net` must be."""
+
+    def __init__(
+        self,
+        net: nn.Module,
+        optimizer: Callable[..., Optimizer] | None = None,
+        scheduler: Callable[[Optimizer], LRScheduler] | None = None,
+    ) -> None:
+        super().__init__()
+        if not isinstance(net, self.takes):
+            raise ValueError(
+                f"net: a {type(self).__name__} takes a {self.takes.__name__}, got a {type(net).__name__}; choose the "
+                "model and the module of one stage (experiment=..., or module=joint_detector, mesh_regressor)"
+            )
+        self.net = net
+        self._make_optimizer = optimizer
+        self._make_scheduler = scheduler
+        self.val_metrics = type(self).metrics(prefix="val/")
+        self.test_metrics = type(self).metrics(prefix="test/")
+
+    @property
+    def body_hashes(self) -> tuple[str, ...]:
+        """Hashes of the bodies that the module itself holds."""
+        return ()
+
+    @abstractmethod
+    def loss(self, batch: Batch) -> Tensor:
+        """Scalar loss of a batch."""
+
+    @abstractmethod
+    def evaluate(self, batch: Batch, metrics: MetricCollection) -> dict[str, Tensor]:
+        """Update a split's metrics with a batch; returns the predictions for callbacks."""
+
+    def configure_optimizers(self) -> OptimizerLRScheduler:
+        """The optimizer and, stepped once an epoch, the scheduler."""
+        if self._make_optimizer is None:
+            return None
+        optimizer = self._make_optimizer(self.parameters())
+        if self._make_scheduler is None:
+            return optimizer
+        return {"optimizer": optimizer, "lr_scheduler": self._make_scheduler(optimizer)}
+
+    def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
+        """Loss of a batch, m^2."""
+        loss = self.loss(batch)
+        if not bool(torch.isfinite(loss)):
+            raise FloatingPointError(
+                f"the training loss is {loss.item()} in epoch {self.current_epoch}, batch {batch_idx}; lower the "
+                "learning rate, or check the data (samples "
+                f"{batch['sample_id'].tolist()})"
+            )
+        self.log("train/loss", loss, on_step=False, on_epoch=True, batch_size=len(batch["joints"]))
+        return loss
+
+    def validation_step(self, batch: Batch, batch_idx: int) -> dict[str, Tensor]:
+        """Update the metrics; returns the predictions for callbacks."""
+        return self.evaluate(batch, self.val_metrics)
+
+    def on_validation_epoch_end(self) -> None:
+        """Log the metrics of the validation set."""
+        self._log_metrics(self.val_metrics)
+
+    def test_step(self, batch: Batch, batch_idx: int) -> dict[str, Tensor]:
+        """Update the metrics; returns the predictions for callbacks."""
+        return self.evaluate(batch, self.test_metrics)
+
+    def on_test_epoch_end(self) -> None:
+        """Log the metrics of the test set."""
+        self._log_metrics(self.test_metrics)
+
+    def _log_metrics(self, metrics: Any) -> None:
+        self.log_dict({name: value.float() for name, value in metrics.compute().items()}, prog_bar=False)
+        metrics.reset()

@@ -1,0 +1,107 @@
+"""Stage 2 as a LightningModule: training, validation and test of a mesh regressor."""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.optim import Optimizer
+from torch.optim.lr_scheduler import LRScheduler
+
+from ljn.body import SMPL, load_body_models
+from ljn.body.skeleton import ROOT
+from ljn.data import Batch
+from ljn.geometry.camera import place_at_root
+from ljn.geometry.rotations import rotmat_to_rotvec
+from ljn.losses import mesh_loss
+from ljn.metrics import MeshMetrics, apve
+from ljn.modules.base import StageModule
+from ljn.nets.body_network import BodyEstimate, BodyNetwork
+
+
+class MeshRegressor(StageModule):
+    """A mesh regressor with its loss on meshes (Eq. 3.7), optimizer and metrics.
+
+    The target is the mesh of the record's gender, the prediction always that of one body; the error that this
+    alone leaves is `floor_apve`.
+
+    Args:
+        net: The network.
+        optimizer: See `StageModule`.
+        scheduler: See `StageModule`.
+        body_path: SMPL-format file or folder; see `ljn.body.load_body_models`.
+        genders: Genders of the records.
+        predicted: Gender of the body that predictions are meshes of.
+    """
+
+    metrics = MeshMetrics
+    takes = BodyNetwork
+    net: BodyNetwork
+
+    def __init__(
+        self,
+        net: BodyNetwork,
+        optimizer: Callable[..., Optimizer] | None = None,
+        scheduler: Callable[[Optimizer], LRScheduler] | None = None,
+        body_path: str | Path | None = None,
+        genders: Sequence[str] = ("female", "male"),
+        predicted: str = "neutral",
+    ) -> None:
+        super().__init__(net, optimizer, scheduler)
+        self.body = SMPL(load_body_models(body_path, [predicted]))
+        self.target_body = SMPL(load_body_models(body_path, list(genders)))
+
+    @property
+    def body_hashes(self) -> tuple[str, ...]:
+        """See `StageModule.body_hashes`."""
+        return (self.body.hash,)
+
+    def forward(self, points: Tensor, initial_joints: Tensor) -> BodyEstimate:
+        """Pose and shape after each iteration; see `BodyNetwork.forward`."""
+        return self.net(points, initial_joints)
+
+    def target(self, batch: Batch) -> tuple[Tensor, Tensor]:
+        """True vertices `(B, V, 3)` and joints `(B, 24, 3)`, metres, body frame."""
+        with torch.no_grad():
+            return self.target_body(batch["pose"], batch["betas"], batch["gender"])
+
+    def loss(self, batch: Batch) -> Tensor:
+        """See `StageModule.loss`."""
+        rotmats, betas = self(batch["points"], batch["initial_joints"])
+        return mesh_loss(self.body.from_rotmats(rotmats, betas).vertices, self.target(batch)[0])
+
+    def evaluate(self, batch: Batch, metrics: Any) -> dict[str, Tensor]:
+        """See `StageModule.evaluate`.
+
+        Gives, all for the last iteration, `pred_vertices` `(B, V, 3)`, `pred_joints` `(B, 24, 3)` and `vertices`
+        (the truth), in the camera frame, metres, the prediction placed at the initial root (Eq. 4.2);
+        `pred_pose` `(B, 72)` and `pred_betas` `(B, 10)`; and each sample's `apve` `(B,)`, mm, body frame.
+        """
+        rotmats, betas = (values[-1] for values in self(batch["points"], batch["initial_joints"]))
+        pred_vertices, pred_joints = self.body.from_rotmats(rotmats, betas)
+        vertices, joints = self.target(batch)
+        metrics.update(
+            pred_vertices=pred_vertices,
+            vertices=vertices,
+            pred_body_joints=pred_joints,
+            body_joints=joints,
+            floor_vertices=self._floor(batch),
+            initial_joints=batch["initial_joints"],
+            joints=batch["joints"],
+        )
+        pred_root, initial_root = pred_joints[:, ROOT], batch["initial_joints"][:, ROOT]
+        return {
+            "pred_vertices": place_at_root(pred_vertices, pred_root, initial_root),
+            "pred_joints": place_at_root(pred_joints, pred_root, initial_root),
+            "vertices": place_at_root(vertices, joints[:, ROOT], batch["joints"][:, ROOT]),
+            "pred_pose": rotmat_to_rotvec(rotmats).flatten(-2),
+            "pred_betas": betas,
+            "apve": apve(pred_vertices, vertices),
+        }
+
+    def _floor(self, batch: Batch) -> Tensor:
+        """Vertices of the predicted body in the true pose, its shape fitted to the true one's rest mesh."""
+        betas = batch["betas"]
+        rest = self.target_body(torch.zeros_like(batch["pose"]), betas, batch["gender"]).vertices
+        return self.body(batch["pose"], self.body.fit_betas(rest)).vertices

@@ -1,0 +1,118 @@
+"""PointNet++ with single-scale grouping (Qi et al. 2017), without batch normalisation, with PReLU."""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+from ljn.geometry.points import ball_group, farthest_point_sampling, gather_points
+from ljn.nets.layers import activate_and_pool, perceptron
+
+
+class SetAbstraction(nn.Module):
+    """One set abstraction: spread centres over the cloud, run a small PointNet on the ball around each.
+
+    Args:
+        num_centres: Number of centres, taken by farthest point sampling; at most the number of points.
+        radius_m: Radius of the balls, metres.
+        group_size: Points in a ball.
+        in_channels: Channels of a point beside its position.
+        channels: Widths of the shared perceptron.
+        relative_to_radius: Whether positions in a ball are in units of its radius, or in metres.
+    """
+
+    def __init__(
+        self,
+        num_centres: int,
+        radius_m: float,
+        group_size: int,
+        in_channels: int,
+        channels: Sequence[int],
+        relative_to_radius: bool = True,
+    ) -> None:
+        super().__init__()
+        self.num_centres = num_centres
+        self.group_size = group_size
+        self.unit_m = radius_m if relative_to_radius else 1.0
+        self.register_buffer("radius", torch.tensor([radius_m]), persistent=False)
+        self.radius: Tensor
+        self.position = nn.Linear(3, channels[0], bias=False)
+        self.feature = nn.Linear(in_channels, channels[0])
+        self.first_activation = nn.PReLU()
+        self.rest = perceptron(channels, last_activation=False)
+        self.last_activation = nn.PReLU()
+
+    def forward(self, positions: Tensor, features: Tensor) -> tuple[Tensor, Tensor]:
+        """Centres and their features.
+
+        Args:
+            positions: `(B, N, 3)`, metres.
+            features: `(B, N, in_channels)`.
+
+        Returns:
+            Positions `(B, M, 3)` and features `(B, M, channels[-1])` of the centres.
+        """
+        centres = gather_points(positions, farthest_point_sampling(positions, self.num_centres))
+        radii = self.radius.expand(self.num_centres)
+        index = ball_group(positions, centres, radii, self.group_size)  # (B, M, n)
+        # The first layer is linear in a point's position and feature: once for each point, not once for each
+        # of its appearances in a ball; the ball's centre is taken off afterwards.
+        hidden = self.feature(features) + self.position(positions / self.unit_m)
+        hidden = gather_points(hidden, index) - self.position(centres / self.unit_m)[:, :, None]
+        hidden = self.rest(self.first_activation(hidden))  # (B, M, n, C)
+        return centres, activate_and_pool(hidden, self.last_activation, 2)
+
+
+class PointNet2(nn.Module):
+    """The trunk: set abstractions, then a PointNet over the last centres: one feature for the whole cloud.
+
+    Its sampling begins at a geometric point, so it is deterministic and does not depend on the order of the
+    points, unless a ball holds more than `group_sizes` of them.
+
+    Args:
+        in_channels: Channels of a point, its position included.
+        num_centres: Centres of each set abstraction.
+        radii_m: Their balls' radii, metres.
+        group_sizes: Their balls' numbers of points.
+        channels: Their widths.
+        global_channels: Widths of the last PointNet, up to the global feature.
+        relative_to_radius: See `SetAbstraction`.
+
+    Raises:
+        ValueError: The lists differ in length.
+    """
+
+    def __init__(
+        self,
+        in_channels: int = 6,
+        num_centres: Sequence[int] = (512, 128),
+        radii_m: Sequence[float] = (0.2, 0.4),
+        group_sizes: Sequence[int] = (32, 64),
+        channels: Sequence[Sequence[int]] = ((64, 64, 128), (128, 128, 256)),
+        global_channels: Sequence[int] = (256, 512, 1024),
+        relative_to_radius: bool = True,
+    ) -> None:
+        super().__init__()
+        lengths = {len(num_centres), len(radii_m), len(group_sizes), len(channels)}
+        if len(lengths) != 1:
+            raise ValueError(
+                "num_centres, radii_m, group_sizes and channels: expected one entry for each set abstraction, got "
+                f"{len(num_centres)}, {len(radii_m)}, {len(group_sizes)} and {len(channels)}"
+            )
+        widths = [in_channels, *(layers[-1] for layers in channels)]
+        self.abstractions = nn.ModuleList(
+            SetAbstraction(number, radius, size, width, layers, relative_to_radius)
+            for number, radius, size, width, layers in zip(
+                num_centres, radii_m, group_sizes, widths, channels
+            )
+        )
+        self.lift = perceptron([3 + widths[-1], *global_channels], last_activation=False)
+        self.lift_activation = nn.PReLU()
+        self.out_channels = global_channels[-1]
+
+    def forward(self, points: Tensor) -> Tensor:
+        """`(B, N, in_channels)`, position first, metres -> the global feature `(B, global_channels[-1])`."""
+        positions, features = points[..., :3], points
+        for abstraction in self.abstractions:
+            positions, features = abstraction(positions, features)
+        return activate_and_pool(self.lift(torch.cat([positions, features], -1)), self.lift_activation, 1)

@@ -1,0 +1,48 @@
+"""The simple baseline (Martinez et al. 2017): 2D joints in, root-relative 3D joints out, no cloud."""
+
+import torch
+from torch import Tensor, nn
+
+from ljn.body.skeleton import NUM_JOINTS, ROOT
+from ljn.nets.detector import Detector
+
+
+class SimpleBaseline(Detector):
+    """A residual network from the 2D keypoints to 3D joints relative to the root.
+
+    It sees the initial joints' rays alone, (x / z, y / z), which are the keypoints in normalised image coordinates;
+    neither their depths nor the cloud. Its joints stand around the initial root, so only its root-aligned errors
+    mean something. Unlike the thesis's networks it has batch normalisation and dropout; the weights' max-norm
+    of the original is left out.
+
+    Args:
+        channels: Width of the hidden layers.
+        num_blocks: Residual blocks of two layers each.
+        dropout: Share of the hidden values that are dropped in training.
+    """
+
+    def __init__(self, channels: int = 1024, num_blocks: int = 2, dropout: float = 0.5) -> None:
+        super().__init__(output="offset")
+
+        def layer(fan_in: int) -> list[nn.Module]:
+            return [nn.Linear(fan_in, channels), nn.BatchNorm1d(channels), nn.ReLU(), nn.Dropout(dropout)]
+
+        self.first = nn.Sequential(*layer(2 * NUM_JOINTS))
+        self.blocks = nn.ModuleList(
+            nn.Sequential(*layer(channels), *layer(channels)) for _ in range(num_blocks)
+        )
+        self.last = nn.Linear(channels, 3 * NUM_JOINTS)
+
+    def forward(self, points: Tensor, initial_joints: Tensor) -> Tensor:
+        """See `Detector.forward`; `points` are not looked at."""
+        return self.regress(points, initial_joints) + initial_joints[:, ROOT, None]
+
+    def regress(self, points: Tensor, initial_joints: Tensor) -> Tensor:
+        """Joints relative to the root, `(B, 24, 3)`, metres, from initial joints in the camera frame."""
+        rays = initial_joints[..., :2] / initial_joints[..., 2:]
+        # The root's ray itself, the others relative to it.
+        rays = torch.cat([rays[:, :1], rays[:, 1:] - rays[:, :1]], 1)
+        hidden = self.first(rays.flatten(1))
+        for block in self.blocks:
+            hidden = hidden + block(hidden)
+        return self.last(hidden).unflatten(-1, (NUM_JOINTS, 3))

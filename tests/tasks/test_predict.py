@@ -1,0 +1,218 @@
+import json
+import shutil
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+import ljn.tasks.predict
+from ljn import SMPL, Pipeline
+from ljn.body.skeleton import JOINT_INDEX, ROOT
+from ljn.geometry.camera import project
+from ljn.render import get_renderer
+from ljn.system.keypoints import ORDERS
+from ljn.tasks.predict import predict
+
+README_EXAMPLE = """
+from ljn import Camera, Pipeline
+
+pipeline = Pipeline.load("detector.ckpt", "mesh.ckpt")
+prediction = pipeline(depth, Camera(fx, fy, cx, cy, width, height), keypoints)
+prediction.joints, prediction.vertices, prediction.pose  # (24, 3), (6890, 3) metres, camera frame; (72,)
+"""
+
+
+@pytest.fixture(scope="session")
+def files(kinect, tmp_path_factory):
+    """A user's files: a person in front of a wall, 2.3 m away, with the arms held down."""
+    directory = tmp_path_factory.mktemp("files")
+    body = SMPL.load()
+    pose = torch.zeros(24, 3)
+    pose[JOINT_INDEX["l_shoulder"], 2], pose[JOINT_INDEX["r_shoulder"], 2] = -1.1, 1.1
+    vertices, joints = body(pose.flatten(), torch.zeros(10))
+    upright = torch.tensor([1.0, -1, -1])  # SMPL's rest frame to camera axes
+    place = torch.tensor([0.1, 0, 2.3])
+    vertices, joints = ((x - joints[ROOT]) * upright + place for x in (vertices, joints))
+    depth = get_renderer("zbuffer")(vertices[None], body.faces, kinect)[0].numpy()
+    behind = np.where(depth > 0, depth, np.float32(3.5))
+    Image.fromarray((1000 * behind).round().astype(np.uint16)).save(directory / "depth.png")
+    Image.fromarray(255 * (depth > 0).astype(np.uint8)).save(directory / "mask.png")
+    keypoints = project(joints, kinect.intrinsics()).numpy().astype(float)
+    names = ORDERS["coco17"].names
+    coco = {
+        keypoint: keypoints[JOINT_INDEX[joint]].tolist()
+        for joint, taken in ORDERS["coco17"].joints.items()
+        for keypoint in taken.keypoints
+    }
+    (directory / "keypoints.json").write_text(json.dumps([coco.get(name) for name in names]))
+    (directory / "camera.json").write_text(json.dumps(vars(kinect)))
+    return directory
+
+
+@pytest.fixture
+def config(smoke_config, files, checkpoints, tmp_path):
+    """The configuration of a valid call, with changes as `key=value`."""
+
+    def make(*changes):
+        paths = {
+            "input": files / "depth.png",
+            "camera": files / "camera.json",
+            "keypoints": files / "keypoints.json",
+            "mask": files / "mask.png",
+            "ckpt_path": checkpoints[0],
+            "mesh_ckpt_path": checkpoints[1],
+        }
+        given = [f"{key}={path}" for key, path in paths.items()]
+        return smoke_config(tmp_path, "task=predict", *given, *changes)
+
+    return make
+
+
+@pytest.fixture
+def folders(files, tmp_path):
+    """Folders of three frames with masks, the second of which is damaged; and an older output of it."""
+    for name, suffix in (("depth", ".png"), ("keypoints", ".json"), ("mask", ".png")):
+        (tmp_path / name).mkdir()
+        for frame in ("a", "b", "c"):
+            shutil.copy(files / f"{name}{suffix}", tmp_path / name / f"{frame}{suffix}")
+    (tmp_path / "depth" / "b.png").write_bytes((files / "depth.png").read_bytes()[:500])
+    outputs = tmp_path / "predictions" / "depth"
+    outputs.mkdir(parents=True)
+    (outputs / "b.npz").write_bytes(b"of an earlier call")
+    changes = [
+        f"{key}={tmp_path / name}"
+        for key, name in (("input", "depth"), ("keypoints", "keypoints"), ("mask", "mask"))
+    ]
+    return changes, outputs
+
+
+def test_the_command_predicts_an_image(config, files, checkpoints, run_py, tmp_path):
+    done = run_py(
+        *("task=predict", f"input={files / 'depth.png'}", f"camera={files / 'camera.json'}"),
+        *(f"keypoints={files / 'keypoints.json'}", f"mask={files / 'mask.png'}"),
+        *(f"ckpt_path={checkpoints[0]}", f"mesh_ckpt_path={checkpoints[1]}", f"paths.output_dir={tmp_path}"),
+    )
+    outputs = tmp_path / "predictions" / "depth"
+    assert {path.name for path in outputs.iterdir()} == {
+        *(f"depth{suffix}" for suffix in (".npz", ".ply", ".glb", ".png")),
+        "predictions.json",
+    }
+    summary = json.loads((outputs / "predictions.json").read_text())
+    assert f"{summary['predict/median_distance_mm']:10.3f}" in done.stdout
+    assert summary["frames"]["depth"]["filled_in"][0] == "pelvis"
+    assert (summary["detector"]["run"], summary["regressor"]["run"]) == ("detector/proposed", "mesh/proposed")
+    with np.load(outputs / "depth.npz") as arrays:
+        assert arrays["vertices"].shape == (6890, 3)
+
+
+def test_without_a_mesh_checkpoint_joints_alone_are_written(config, tmp_path):
+    assert predict(config("mesh_ckpt_path=null")) == {"predict/frames": 1}
+    outputs = tmp_path / "predictions" / "depth"
+    assert {path.name for path in outputs.iterdir()} == {"depth.npz", "depth.png", "predictions.json"}
+
+
+def test_a_damaged_frame_of_a_folder_is_reported_and_costs_the_others_nothing(folders, config):
+    changes, outputs = folders
+    with pytest.raises(
+        ValueError, match=r"1 of 3 frames failed, all others are written; the first is b: depth: .*damaged"
+    ):
+        predict(config(*changes))
+    assert {path.stem for path in outputs.glob("*.npz")} == {"a", "c"}
+    summary = json.loads((outputs / "predictions.json").read_text())
+    assert (summary["predict/frames"], summary["predict/failed"]) == (2, 1)
+    assert "is damaged" in summary["frames"]["b"]["error"]
+    assert summary["frames"]["a"]["median_distance_mm"] == summary["frames"]["c"]["median_distance_mm"]
+
+
+def test_keypoints_that_are_missing_for_a_frame_fail_that_frame(folders, config, tmp_path):
+    changes, outputs = folders
+    (tmp_path / "keypoints" / "c.json").unlink()
+    with pytest.raises(ValueError, match="2 of 3 frames failed"):
+        predict(config(*changes, "mesh_ckpt_path=null"))
+    assert {path.stem for path in outputs.glob("*.npz")} == {"a"}
+
+
+@pytest.mark.parametrize("key", ["input", "camera", "keypoints", "ckpt_path"])
+def test_what_a_prediction_needs_is_named(key, config):
+    with pytest.raises(
+        ValueError, match=f"{key}: expected a path, got null; python run.py task=predict input="
+    ):
+        predict(config(f"{key}=null"))
+
+
+@pytest.mark.parametrize("key", ["input", "camera", "keypoints", "mask", "ckpt_path", "mesh_ckpt_path"])
+def test_a_missing_file_is_an_error(key, config):
+    with pytest.raises(FileNotFoundError, match=r"no file .*'nowhere\.x'"):
+        predict(config(f"{key}=nowhere.x"))
+
+
+def test_nothing_is_loaded_before_the_cheap_checks(config, folders, monkeypatch, tmp_path):
+    monkeypatch.setattr(ljn.tasks.predict, "Pipeline", None)
+    changes, _ = folders
+    with pytest.raises(
+        ValueError,
+        match="files or folders alike, got: input is a folder, keypoints is a folder, mask is a file",
+    ):
+        predict(config(*changes[:2]))
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(FileNotFoundError, match=r"no depth image \(\.png, \.npy, \.npz\) in"):
+        predict(config(*changes[1:], f"input={tmp_path / 'empty'}"))
+    (tmp_path / "depth" / "a.npy").touch()
+    with pytest.raises(ValueError, match=r"'a.npy' and 'a.png' would write the same outputs"):
+        predict(config(*changes))
+
+
+def test_the_model_and_data_of_the_configuration_do_not_matter(config):
+    broken = config("mesh_ckpt_path=null", "model.radii_m=[1]", "data.num_points=0")
+    assert predict(broken) == {"predict/frames": 1}
+
+
+def test_checkpoints_that_changed_places_are_refused(checkpoints):
+    with pytest.raises(
+        ValueError, match=r"detector_ckpt: expected the checkpoint of a JointDetector.*changed places"
+    ):
+        Pipeline.load(*reversed(checkpoints))
+    with pytest.raises(ValueError, match="mesh_ckpt: expected the checkpoint of a MeshRegressor"):
+        Pipeline.load(checkpoints[0], checkpoints[0])
+
+
+def with_body_hash(path, body_hash, target):
+    content = torch.load(path, weights_only=True)
+    content["ljn"]["body_hash"] = body_hash
+    torch.save(content, target)
+    return target
+
+
+def test_checkpoints_of_different_bodies_are_refused(checkpoints, tmp_path):
+    detector, mesh = checkpoints
+    other = with_body_hash(detector, "0123456789abcdef", tmp_path / "other.ckpt")
+    with pytest.raises(
+        ValueError, match=r"0123456789abcdef of '.*other.ckpt' is not among them.*same bodies"
+    ):
+        Pipeline.load(other, mesh)
+    hashes = torch.load(detector, weights_only=True)["ljn"]["body_hash"]
+    older = with_body_hash(mesh, hashes, tmp_path / "older.ckpt")  # the neutral body was another one
+    with pytest.raises(ValueError, match=r"mesh_ckpt: .*but the body found here is [0-9a-f]{16}"):
+        Pipeline.load(detector, older)
+
+
+def test_the_pipeline_takes_points_and_normals_from_the_checkpoints(checkpoints):
+    pipeline = Pipeline.load(*checkpoints)
+    assert (pipeline.detector.cloud.num_points, pipeline.detector.cloud.normals) == (128, "window")
+    assert pipeline.detector.cloud.spacing_m == pytest.approx(1.5 / 366.458)
+    assert not pipeline.regressor.module.training
+
+
+def test_the_readme_s_example_runs(checkpoints, files, kinect, monkeypatch):
+    monkeypatch.chdir(checkpoints[0].parent)
+    depth = np.asarray(Image.open(files / "depth.png"))
+    depth = np.where(np.asarray(Image.open(files / "mask.png")) > 0, depth, 0)
+    names = {"depth": depth, "keypoints": json.loads((files / "keypoints.json").read_text()), **vars(kinect)}
+    exec(README_EXAMPLE, names)
+    prediction = names["prediction"]
+    assert (prediction.joints.shape, prediction.vertices.shape, prediction.pose.shape) == (
+        (24, 3),
+        (6890, 3),
+        (72,),
+    )
