@@ -20,7 +20,7 @@ SKIN = (0.80, 0.72, 0.66)
 _LIGHT = np.array(
     [-0.25, -0.35, -0.90]
 )  # towards the light: camera frame, from behind the camera's left shoulder
-_FROM_THE_SIDE = np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
+FROM_THE_SIDE = np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
 """The camera's axes turned about the vertical, so that what is far lies to the right."""
 
 
@@ -138,7 +138,7 @@ def draw_meshes(samples: list[MeshSample], faces: np.ndarray, num_columns: int) 
         size_m = 1.1 * float(np.ptp(np.concatenate([sample.vertices, sample.pred_vertices]), axis=0).max())
         panels = [
             (view, vertices, colour)
-            for view in (np.eye(3), _FROM_THE_SIDE)
+            for view in (np.eye(3), FROM_THE_SIDE)
             for vertices, colour in (
                 (sample.pred_vertices, (0.90, 0.55, 0.50)),
                 (sample.vertices, (0.55, 0.68, 0.92)),
@@ -164,13 +164,13 @@ def _panel_camera(size_m: float) -> Camera:
 def _draw_mesh_view(
     axis: "Axes", vertices: np.ndarray, faces: np.ndarray, size_m: float, colour: tuple[float, float, float]
 ) -> None:
-    seen = vertices + [0, 0, _PANEL_DISTANCE_M]
+    seen = vertices + np.array([0, 0, _PANEL_DISTANCE_M])
     axis.imshow(shade_mesh(seen, faces, _panel_camera(size_m), colour))
 
 
 def _draw_cloud_over(axis: "Axes", points: np.ndarray, size_m: float) -> None:
     camera = _panel_camera(size_m)
-    seen = points + [0, 0, _PANEL_DISTANCE_M]
+    seen = points + np.array([0, 0, _PANEL_DISTANCE_M])
     axis.scatter(
         camera.fx * seen[:, 0] / seen[:, 2] + camera.cx,
         camera.fy * seen[:, 1] / seen[:, 2] + camera.cy,
@@ -195,7 +195,7 @@ def shade_mesh(
         faces: `(F, 3)`, vertex indices, outwards counter-clockwise.
         camera: The camera.
         colour: RGB in 0-1, one or `(F, 3)`, one for each face.
-        background: What is seen beside the mesh: grey, or an image `(H, W, 3)`.
+        background: What is seen beside the mesh: grey (NaN to find out where the mesh is), or an image `(H, W, 3)`.
 
     Returns:
         `(H, W, 3)` RGB in 0-1.
@@ -207,7 +207,7 @@ def shade_mesh(
         np.add.at(normals, faces[:, corner], face_normals)
     seen = get_renderer("zbuffer").fragments(
         torch.from_numpy(np.ascontiguousarray(vertices, dtype=np.float64))[None],
-        torch.from_numpy(faces),
+        torch.tensor(faces),
         camera,
     )
     face_ids, shares = seen.face_ids[0].numpy(), seen.barycentrics[0].numpy()

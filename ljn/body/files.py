@@ -190,7 +190,8 @@ def load_body_models(path: str | Path | None, genders: Sequence[str]) -> tuple[B
         if not files:
             raise FileNotFoundError(
                 f"path: no body of gender {gender} in {path}; expected SMPL_{gender.upper()}.pkl, {gender}.npz or the "
-                "official name (basicmodel_..._lbs_10_207_0_v1.1.0.pkl). Put it there, or leave the gender out (body.genders)"
+                "official name (basicmodel_..._lbs_10_207_0_v1.1.0.pkl). Put it there, or leave the gender out "
+                "(body.genders)"
             )
         if len(files) > 1:
             names = ", ".join(file.name for file in files)

@@ -3,12 +3,10 @@
 from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
 
 from ljn.body.skeleton import BONES, ROOT
-from ljn.drawing import new_figure
+from ljn.drawing import FROM_THE_SIDE, new_figure, shade_mesh
 from ljn.geometry.camera import Camera
-from ljn.render import get_renderer
 from ljn.system.pipeline import Prediction
 
 if TYPE_CHECKING:
@@ -16,12 +14,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _INITIAL, _PREDICTED, _FILLED = "#8f9aa8", "#d62728", "#ff9f1c"
-_SKIN = np.array([0.45, 0.62, 0.86])
+_MESH = (0.45, 0.62, 0.86)
 _MESH_OPACITY = 0.75
 _NEAREST_M = 0.1
 _BESIDE = Camera(fx=400, fy=400, cx=512, cy=512, width=1024, height=1024)
-_FROM_THE_SIDE = np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
-"""Camera axes of the view from the camera's right-hand side, where what was away goes to the right."""
 
 
 def draw_prediction(prediction: Prediction, depth: np.ndarray, camera: Camera) -> "Figure":
@@ -102,7 +98,8 @@ def _draw_meshes(
         side.set_axis_off()
         front.set_title("the mesh is not before the camera", fontsize=9, loc="left")
         return
-    colours, is_mesh = _shaded(vertices, faces, camera)
+    colours = shade_mesh(vertices, faces, camera, _MESH, background=np.nan)
+    is_mesh = np.isfinite(colours[..., 0])
     body = depth[depth > 0]
     grey = np.where(depth > 0, 0.9 - 0.5 * (depth - body.min()) / max(float(np.ptp(body)), 1e-6), 1.0)
     image = np.where(
@@ -115,30 +112,11 @@ def _draw_meshes(
     # Seen from as far as by the camera, with the root in the middle of the picture.
     root = prediction.joints[ROOT]
     distance = np.array([0, 0, max(root[2], 1.5)])
-    turned = (vertices - root) @ _FROM_THE_SIDE.T + distance
-    colours, is_mesh = _shaded(turned, faces, _BESIDE)
-    points = (prediction.points[:, :3] - root) @ _FROM_THE_SIDE.T + distance
+    turned = (vertices - root) @ FROM_THE_SIDE.T + distance
+    colours = shade_mesh(turned, faces, _BESIDE, _MESH)
+    points = (prediction.points[:, :3] - root) @ FROM_THE_SIDE.T + distance
     pixels = points[:, :2] / points[:, 2:] * _BESIDE.fx + _BESIDE.cx
     side.imshow(colours)
     side.scatter(pixels[:, 0], pixels[:, 1], s=0.8, c="black", alpha=0.35, linewidths=0)
-    _crop(side, is_mesh, pixels)
+    _crop(side, (colours < 1).any(-1), pixels)
     side.set_title("mesh and cloud, side", fontsize=9, loc="left")
-
-
-def _shaded(vertices: np.ndarray, faces: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """A mesh lit from the camera on white: colours `(H, W, 3)` and where it is seen `(H, W)` bool."""
-    corners = vertices[faces]
-    face_normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normals = np.zeros_like(vertices)
-    for corner in range(3):
-        np.add.at(normals, faces[:, corner], face_normals)
-    seen = get_renderer("zbuffer").fragments(
-        torch.from_numpy(vertices.astype(np.float32))[None], torch.from_numpy(faces), camera
-    )
-    is_mesh = seen.depth[0].numpy() > 0
-    face_ids, shares = seen.face_ids[0].numpy()[is_mesh], seen.barycentrics[0].numpy()[is_mesh]
-    normal = (normals[faces[face_ids]] * shares[..., None]).sum(-2)
-    light = np.abs(normal[:, 2:]) / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
-    colours = np.ones((*is_mesh.shape, 3))
-    colours[is_mesh] = _SKIN * (0.25 + 0.75 * light)
-    return colours, is_mesh

@@ -32,6 +32,7 @@ from datamodules.sources.generation.penetration import penetration
 from datamodules.sources.generation.reference import REFERENCE_CAPSULES, REFERENCE_OFFSETS
 from ljn.body import SMPL, load_body_models
 from ljn.body.skeleton import JOINT_INDEX, NUM_JOINTS, ROOT
+from ljn.drawing import shade_mesh
 from ljn.geometry.camera import Camera
 from ljn.geometry.rotations import (
     CAMERA_FROM_BODY,
@@ -40,7 +41,6 @@ from ljn.geometry.rotations import (
     rotmat_to_rotvec,
     rotvec_to_rotmat,
 )
-from ljn.render import get_renderer
 
 NUM_POOL, NUM_QUERIES, NUM_REAL = 20_000, 2_500, 30_000
 HELD_OUT = ("01", "03", "06", "08", "09", "11")
@@ -48,6 +48,7 @@ HELD_OUT = ("01", "03", "06", "08", "09", "11")
 
 HARDEST = ("01", "05")  # climbing; ballet
 SHEET_COLUMNS, SHEET_SEED = 8, 1
+GREY = (0.85, 0.85, 0.85)
 
 MEASURED = [
     JOINT_INDEX[name]
@@ -288,29 +289,17 @@ def draw_sheet(records: PoseRecords) -> Image.Image:
     # Seen from a little above, along x, from the height of a standing person's hips.
     cam_from_world = rotation_about("x", tilt) @ CAMERA_FROM_BODY
     hips, away = torch.tensor([0.0, 0.0, 0.95]), torch.tensor([0.0, 0.0, distance])
-    depth = get_renderer()((vertices - hips) @ cam_from_world.T + away, smpl.faces, camera).numpy()
+    meshes = ((vertices - hips) @ cam_from_world.T + away).numpy()
     _, floor_y, floor_z = (-cam_from_world @ hips.double() + away).tolist()
     floor_row = round(focal * floor_y / floor_z + camera.cy)
 
-    page = np.full((SHEET_COLUMNS * size, SHEET_COLUMNS * size), 255.0)
-    for number, image in enumerate(depth):
+    page = np.ones((SHEET_COLUMNS * size, SHEET_COLUMNS * size, 3))
+    for number, mesh in enumerate(meshes):
         row, column = (size * index for index in divmod(number, SHEET_COLUMNS))
         tile = page[row : row + size, column : column + size]
-        tile[floor_row : floor_row + oversampling] = 150
-        tile[image > 0] = 255 * shade(image.astype(np.float64), camera)[image > 0]
-    return Image.fromarray(page.astype(np.uint8)).reduce(oversampling)
-
-
-def shade(depth: np.ndarray, camera: Camera) -> np.ndarray:
-    """Brightness `(H, W)` in [0, 1] of a depth image `(H, W)`, metres, lit from above on the left."""
-    light = np.array([-0.45, -0.6, -0.7]) / np.linalg.norm([0.45, 0.6, 0.7])
-    v, u = np.indices(depth.shape)
-    z = np.where(depth > 0, depth, np.nan)
-    points = np.stack([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z], -1)
-    normals = np.cross(np.gradient(points, axis=0), np.gradient(points, axis=1))
-    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
-    normals *= -np.sign(normals[..., 2:])  # towards the camera
-    return np.nan_to_num(0.25 + 0.7 * (normals @ light).clip(0), nan=0.35)  # silhouettes have no normal
+        tile[floor_row : floor_row + oversampling] = 0.6
+        tile[:] = shade_mesh(mesh, smpl.faces.numpy(), camera, GREY, background=tile.copy())
+    return Image.fromarray((255 * page[..., 0]).astype(np.uint8)).reduce(oversampling)
 
 
 def main() -> None:

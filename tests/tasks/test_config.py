@@ -45,9 +45,13 @@ def test_every_config_composes_validates_and_builds(choice, compose_config, tmp_
 
 
 def test_a_network_of_the_other_stage_is_refused(compose_config):
-    with pytest.raises(ValueError, match=r"net: a JointDetector takes a Detector, got a Hierarchical.*module="):
+    with pytest.raises(
+        ValueError, match=r"net: a JointDetector takes a Detector, got a Hierarchical.*module="
+    ):
         build(compose_config("model=body_network").module)
-    with pytest.raises(ValueError, match=r"net: a MeshRegressor takes a BodyNetwork, got a LocalJointNetwork"):
+    with pytest.raises(
+        ValueError, match=r"net: a MeshRegressor takes a BodyNetwork, got a LocalJointNetwork"
+    ):
         build(compose_config("module=mesh_regressor").module)
 
 

@@ -10,10 +10,9 @@ from ljn.body.build.measures import posed
 from ljn.body.build.poses import ARMS_DOWN, EXTREME_POSES, pose_vector
 from ljn.body.files import NUM_BETAS, BodyModel
 from ljn.body.parts import PART_NAMES, face_parts
-from ljn.drawing import new_figure
+from ljn.drawing import SKIN, new_figure, shade_mesh
 from ljn.geometry.camera import Camera
 from ljn.geometry.rotations import rotation_about
-from ljn.render import get_renderer
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
@@ -21,8 +20,6 @@ Image = NDArray[np.uint8]
 _DISTANCE = 40.0
 """Metres to the camera: far enough for an almost parallel projection."""
 _SUPERSAMPLING = 2
-_SKIN = np.array([0.80, 0.72, 0.66])
-_LIGHT = np.array([-0.35, -0.55, -0.76])  # towards the light: camera frame, from above and the left
 _VIEWS = {"front": 0.0, "side": -90.0, "back": 180.0, "oblique": -40.0}
 """How far, in degrees about the vertical, the body is turned before it is drawn."""
 
@@ -47,7 +44,7 @@ def draw_body(
         width: Of the window, metres.
         height: Of the window, metres.
         centre: `(x, y, z)`, metres, the point in the middle of the picture; None takes the mesh's box.
-        colours: `(F, 3)` RGB in 0..1, equal within patches of few different colours; None for skin.
+        colours: `(F, 3)` RGB in 0-1; None for skin.
 
     Returns:
         `(height * scale, width * scale, 3)` RGB.
@@ -58,32 +55,9 @@ def draw_body(
     fine = scale * _SUPERSAMPLING
     columns, rows = round(width * fine), round(height * fine)
     camera = Camera(_DISTANCE * fine, _DISTANCE * fine, (columns - 1) / 2, (rows - 1) / 2, columns, rows)
-    mesh = torch.from_numpy(np.ascontiguousarray(seen))[None]
-    render = get_renderer("zbuffer")
-    depth = render(mesh, torch.tensor(faces), camera)[0].double().numpy()
-    albedo = np.tile(_SKIN, (rows, columns, 1))
-    if colours is not None:
-        for colour in np.unique(colours, axis=0):
-            patch = torch.from_numpy(faces[(colours == colour).all(1)])
-            albedo[(depth > 0) & (render(mesh, patch, camera)[0].double().numpy() == depth)] = colour
-    image = _shade(depth, albedo, 1 / fine)
+    image = shade_mesh(seen, faces, camera, SKIN if colours is None else colours)
     image = image.reshape(rows // _SUPERSAMPLING, _SUPERSAMPLING, -1, _SUPERSAMPLING, 3).mean((1, 3))
     return np.round(255 * image).astype(np.uint8)
-
-
-def _shade(depth: Array, albedo: Array, pitch: float) -> Array:
-    """Lambert's shading of a depth image `(H, W)` with pixels of `pitch` metres; white where depth is 0."""
-    hole = depth == 0
-    steps = []
-    for axis in (0, 1):
-        before, after = np.roll(depth, 1, axis), np.roll(depth, -1, axis)
-        backward, forward = depth - before, after - depth
-        # The flatter of the two neighbours: at a silhouette the other one lies on something else.
-        steps.append(np.where(np.abs(backward) < np.abs(forward), backward, forward))
-    normals = np.stack([steps[1], steps[0], np.full_like(depth, -pitch)], -1)
-    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
-    light = np.clip(normals @ (_LIGHT / np.linalg.norm(_LIGHT)), 0, 1)
-    return np.where(hole[..., None], 1.0, albedo * (0.25 + 0.75 * light)[..., None])
 
 
 def draw_page(models: list[BodyModel], path: Path, seed: int = 2) -> None:
@@ -165,7 +139,11 @@ def _write(rows: list[tuple[str, Image]], path: Path) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     picture = PIL.Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3])
     # Colours from a palette make the file a third as large.
-    ramps = [np.linspace(0, 1, 40)[:, None] * _SKIN, np.linspace(1, _SKIN, 10), np.linspace(0, [1, 1, 1], 8)]
+    ramps = [
+        np.linspace(0, 1, 40)[:, None] * np.array(SKIN),
+        np.linspace(1, SKIN, 10),
+        np.linspace(0, [1, 1, 1], 8),
+    ]
     ramps += [np.linspace(0.2, 1, 11)[:, None] * colour for colour in _part_colours()]
     palette = PIL.Image.new("P", (1, 1))
     palette.putpalette(np.round(255 * np.concatenate(ramps)).astype(np.uint8).tobytes())
