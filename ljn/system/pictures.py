@@ -118,5 +118,5 @@ def _draw_meshes(
     pixels = points[:, :2] / points[:, 2:] * _BESIDE.fx + _BESIDE.cx
     side.imshow(colours)
     side.scatter(pixels[:, 0], pixels[:, 1], s=0.8, c="black", alpha=0.35, linewidths=0)
-    _crop(side, (colours < 1).any(-1), pixels)
+    _crop(side, np.any(colours < 1, axis=-1), pixels)
     side.set_title("mesh and cloud, side", fontsize=9, loc="left")
