@@ -143,9 +143,15 @@ class SyntheticDepthDataModule(BodyDataModule):
     @property
     def fingerprint(self) -> str:
         """See `BodyDataModule`."""
+        if self._detector_checkpoint is None:
+            return self._samples_fingerprint
+        made_of = f"{self._samples_fingerprint} {self._detector_checkpoint[1].file_hash}"
+        return hashlib.sha256(made_of.encode()).hexdigest()[:16]
+
+    @property
+    def _samples_fingerprint(self) -> str:
+        """Hash of what samples are made of before a detector sees them."""
         made_of = f"{EMBEDDED_DATA_VERSION} {self.body_hash} {self.source.name} {self.source.fingerprint}"
-        if self._detector_checkpoint is not None:
-            made_of += f" {self._detector_checkpoint[1].file_hash}"
         return hashlib.sha256(made_of.encode()).hexdigest()[:16]
 
     @property
@@ -185,10 +191,10 @@ class SyntheticDepthDataModule(BodyDataModule):
         _ = self.bodies
         if self._detector_checkpoint is not None:
             checkpoint = self._detector_checkpoint[1]
-            if unknown := [body for body in self.bodies if body.hash not in checkpoint.body_hash.split("-")]:
+            if unknown := checkpoint.unknown_bodies(body.hash for body in self.bodies):
                 raise ValueError(
                     f"detector_ckpt: '{self.detector_ckpt}' was trained with the bodies {checkpoint.body_hash}, and "
-                    f"{unknown[0].gender} {unknown[0].hash} is not among them; a model is only meaningful with its "
+                    f"{unknown[0]} is not among them; a model is only meaningful with its "
                     "bodies"
                 )
         get_renderer(self.settings.renderer)
@@ -243,8 +249,9 @@ class SyntheticDepthDataModule(BodyDataModule):
         return DataLoader(self._fixed["test"], self.batch_size, collate_fn=_as_is)
 
     def fixed_key(self, split: str) -> str:
-        """Hash of everything that a fixed set depends on."""
-        made_of = f"{self.fingerprint} {split} {self.sizes[split]} {self.pool_seed} {self.eval_seed} {self.settings}"
+        """Hash of everything that a fixed set depends on; a detector works on it afterwards."""
+        seeds = f"{self.pool_seed} {self.eval_seed}"
+        made_of = f"{self._samples_fingerprint} {split} {self.sizes[split]} {seeds} {self.settings}"
         return f"{split}-{hashlib.sha256(made_of.encode()).hexdigest()[:16]}"
 
     def _fixed_samples(self, split: str) -> dict[str, Tensor]:

@@ -7,13 +7,14 @@ import torch
 from torch import Tensor
 
 from ljn.body.skeleton import BONES
-from ljn.data import Batch
 from ljn.geometry.camera import Camera
 from ljn.render import get_renderer
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+    from ljn.data import Batch
 
 _TRUE, _PREDICTED, _CLOUD = "#1f5fd6", "#d62728", "#b9bec6"
 SKIN = (0.80, 0.72, 0.66)
@@ -219,7 +220,7 @@ def shade_mesh(
     return np.where((face_ids >= 0)[..., None], lit, background)
 
 
-def draw_examples(batch: Batch, depth: Tensor) -> "Figure":
+def draw_examples(batch: "Batch", depth: Tensor) -> "Figure":
     """A page of training samples, two a row: depth image with keypoints, cloud with normals, initial joints.
 
     Args:

@@ -17,11 +17,10 @@ from datamodules.sources.generation.mixture import MixtureSettings, PoseMixture
 from datamodules.sources.generation.recombination import Made, clip_donors
 from ljn.body import GENDERS, BodyModel, load_body_model
 from ljn.body.skeleton import NUM_JOINTS
+from ljn.data import EMBEDDED_DATA_VERSION
 from ljn.geometry.rotations import rotmat_to_rotvec, rotvec_to_rotmat, smpl_pose_to_body_world
 
 _DATA = Path(__file__).parent / "data"
-# Raise it when the same settings begin to give other records.
-_GENERATOR_VERSION = 3
 _FIRST_BATCH, _LARGEST_BATCH = 128, 2048  # each is twice the one before: small requests are quick as well
 _POSES, _SHAPES = range(2)  # streams of a batch
 _DECIMALS = 5  # radians; turns the farthest vertex by 0.02 mm
@@ -111,7 +110,7 @@ class EmbeddedSource:
     def fingerprint(self) -> str:
         """See `PoseSource.fingerprint`."""
         settings = asdict(self.settings) | {
-            "version": _GENERATOR_VERSION,
+            "version": EMBEDDED_DATA_VERSION,
             "body": self._body.hash,
             "max_beta": self.max_beta,
             "genders": self.genders,

@@ -30,27 +30,6 @@ class BodyEstimate(NamedTuple):
     betas: Tensor
 
 
-class CloudFeature(nn.Module):
-    """The global feature of a cloud whose points also carry the 72 coordinates of the initial joints.
-
-    Args:
-        trunk: A `PointNet2` or a `PointNet` whose points have 6 + 72 channels.
-    """
-
-    def __init__(self, trunk: PointNet | PointNet2) -> None:
-        super().__init__()
-        self.trunk = trunk
-        self.out_channels = trunk.out_channels
-
-    def forward(self, points: Tensor, initial_joints: Tensor) -> Tensor:
-        """`(B, N, 6)`, `(B, 24, 3)`, metres, camera frame -> `(B, out_channels)`; centred on the initial root."""
-        root = initial_joints[:, ROOT, None]
-        joints = (initial_joints - root).flatten(1)[:, None].expand(-1, points.shape[1], -1)
-        points = torch.cat([points[..., :3] - root, points[..., 3:], joints], -1)
-        features = self.trunk(points)
-        return features if isinstance(self.trunk, PointNet2) else features.pooled
-
-
 class BodyNetwork(nn.Module, ABC):
     """Base of the mesh regressors' networks: an initial estimate from the global feature, then residuals.
 
@@ -58,7 +37,8 @@ class BodyNetwork(nn.Module, ABC):
     and the cut at a half turn lies behind it.
 
     Args:
-        trunk: See `CloudFeature`.
+        trunk: A `PointNet2` or a `PointNet` whose points have 6 + 72 channels: each carries the 72 coordinates of the
+            initial joints.
         num_iterations: How often the estimate is refined, by the same weights.
         rotation: `rotvec` (axis-angle, the thesis's) or `rot6d`.
         head_channels: Hidden widths of the initial estimate's head.
@@ -78,11 +58,9 @@ class BodyNetwork(nn.Module, ABC):
             raise ValueError(f"num_iterations: expected at least 1, got {num_iterations}")
         self.num_iterations = num_iterations
         self.num_angles, self._to_rotmat = ROTATIONS[rotation]
-        self.feature = CloudFeature(trunk)
+        self.trunk = trunk
         num_outputs = NUM_JOINTS * self.num_angles + NUM_BETAS
-        self.head = perceptron(
-            [self.feature.out_channels, *head_channels, num_outputs], last_activation=False
-        )
+        self.head = perceptron([self.trunk.out_channels, *head_channels, num_outputs], last_activation=False)
         identity = [0.0, 0, 0] if rotation == "rotvec" else [1.0, 0, 0, 0, 1, 0]
         self.mean_pose = nn.Parameter(torch.tensor(identity).repeat(NUM_JOINTS, 1))
         self.mean_betas = nn.Parameter(torch.zeros(NUM_BETAS))
@@ -105,6 +83,12 @@ class BodyNetwork(nn.Module, ABC):
         root = BODY_TO_OPENGL.T.to(root) @ root
         return BodyEstimate(torch.cat([root, others], 2), torch.stack(shapes))
 
+    def feature(self, points: Tensor, initial_joints: Tensor) -> Tensor:
+        """The cloud's global feature `(B, C)`, all centred on the initial root; arguments as in a call."""
+        root = initial_joints[:, ROOT, None]
+        joints = (initial_joints - root).flatten(1)[:, None].expand(-1, points.shape[1], -1)
+        return self.trunk.global_feature(torch.cat([points[..., :3] - root, points[..., 3:], joints], -1))
+
     @abstractmethod
     def refine(self, feature: Tensor, pose: Tensor, betas: Tensor) -> "list[tuple[Tensor, Tensor]]":
         """The estimates of all iterations, from the feature `(B, C)`, pose `(B, 24, A)` and betas `(B, 10)`."""
@@ -118,7 +102,7 @@ class HierarchicalBodyNetwork(BodyNetwork):
     tree have equally many ancestors and are refined at once.
 
     Args:
-        trunk: See `CloudFeature`.
+        trunk: See `BodyNetwork`.
         num_iterations: See `BodyNetwork`.
         rotation: See `BodyNetwork`.
         head_channels: See `BodyNetwork`.
@@ -137,7 +121,7 @@ class HierarchicalBodyNetwork(BodyNetwork):
     ) -> None:
         super().__init__(trunk, num_iterations, rotation, head_channels)
         self.passes_ancestors = passes_ancestors
-        size = self.feature.out_channels
+        size = self.trunk.out_channels
         self.joint_regressors = nn.ModuleList(
             JointRegressors(
                 [_ancestors(joint) if passes_ancestors else [] for joint in level],
@@ -225,7 +209,7 @@ class DirectBodyNetwork(BodyNetwork):
     """The basic model (section 3.4.2, Fig. 3.9): one perceptron regresses all residuals of an iteration.
 
     Args:
-        trunk: See `CloudFeature`.
+        trunk: See `BodyNetwork`.
         num_iterations: See `BodyNetwork`.
         rotation: See `BodyNetwork`.
         head_channels: See `BodyNetwork`.
@@ -243,7 +227,7 @@ class DirectBodyNetwork(BodyNetwork):
         super().__init__(trunk, num_iterations, rotation, head_channels)
         num_values = NUM_JOINTS * self.num_angles + NUM_BETAS
         self.regressor = perceptron(
-            [self.feature.out_channels + num_values, *regressor_channels, num_values], last_activation=False
+            [self.trunk.out_channels + num_values, *regressor_channels, num_values], last_activation=False
         )
         start_small(self.regressor[-1])
 

@@ -45,3 +45,7 @@ class PointNet(nn.Module):
         """`(B, N, in_channels)` -> `PointFeatures`; the global feature ignores the order of the points."""
         local = self.local(points)
         return PointFeatures(local, activate_and_pool(self.lift(local), self.lift_activation, 1))
+
+    def global_feature(self, points: Tensor) -> Tensor:
+        """`(B, N, in_channels)` -> `(B, out_channels)`, as `PointNet2.global_feature`."""
+        return self(points).pooled

@@ -116,3 +116,7 @@ class PointNet2(nn.Module):
         for abstraction in self.abstractions:
             positions, features = abstraction(positions, features)
         return activate_and_pool(self.lift(torch.cat([positions, features], -1)), self.lift_activation, 1)
+
+    def global_feature(self, points: Tensor) -> Tensor:
+        """`(B, N, in_channels)` -> `(B, out_channels)`, as `PointNet.global_feature`."""
+        return self(points)

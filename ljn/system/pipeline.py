@@ -153,14 +153,13 @@ class Pipeline:
         if mesh_ckpt is None:
             return cls(detector)
         module, mesh_checkpoint = load_module(mesh_ckpt, MeshRegressor, "mesh_ckpt")
-        known = set(mesh_checkpoint.body_hash.split("-"))
-        if unknown := sorted(set(checkpoint.body_hash.split("-")) - known):
+        if unknown := mesh_checkpoint.unknown_bodies(checkpoint.body_hash.split("-")):
             raise ValueError(
                 f"mesh_ckpt: '{mesh_ckpt}' was trained with the bodies {mesh_checkpoint.body_hash}, and {unknown[0]} "
                 f"of '{detector_ckpt}' is not among them; joints of one body do not fit another's mesh: give two "
                 "checkpoints trained with the same bodies"
             )
-        if unknown := sorted(set(module.body_hashes) - known):
+        if unknown := mesh_checkpoint.unknown_bodies(module.body_hashes):
             raise ValueError(
                 f"mesh_ckpt: '{mesh_ckpt}' was trained with the bodies {mesh_checkpoint.body_hash}, but the body found "
                 f"here is {unknown[0]}; put the training's body file in its place, or use the version of this library "

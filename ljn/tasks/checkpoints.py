@@ -4,7 +4,7 @@ import hashlib
 import os
 import pickle
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -98,6 +98,10 @@ class Checkpoint:
     epoch: int
     state: dict[str, Tensor]
     file_hash: str
+
+    def unknown_bodies(self, hashes: Iterable[str]) -> list[str]:
+        """Those of the bodies' hashes that it was not trained with: a model is only meaningful with its bodies."""
+        return sorted(set(hashes) - set(self.body_hash.split("-")))
 
 
 def read_checkpoint(path: str | Path) -> Checkpoint:

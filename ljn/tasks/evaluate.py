@@ -96,7 +96,7 @@ def evaluate(cfg: DictConfig) -> dict[str, float]:
 
 
 def _check_bodies(checkpoint: Checkpoint, hashes: set[str]) -> None:
-    if unknown := sorted(hashes - set(checkpoint.body_hash.split("-"))):
+    if unknown := checkpoint.unknown_bodies(hashes):
         raise ValueError(
             f"body: the checkpoint was trained with the bodies {checkpoint.body_hash}; {unknown[0]} is not among "
             "them. A model is only meaningful with its bodies: name them with body.path=FILE_OR_FOLDER and "

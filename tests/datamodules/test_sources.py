@@ -311,7 +311,7 @@ def test_the_fingerprint_follows_files_settings_body_and_version(write_source, m
         source = write_source()
         source.__dict__["_body"] = type("Body", (), {"hash": "other"})
         yield source.fingerprint
-        monkeypatch.setattr("datamodules.sources.embedded._GENERATOR_VERSION", -1)
+        monkeypatch.setattr("datamodules.sources.embedded.EMBEDDED_DATA_VERSION", -1)
         yield write_source().fingerprint
 
     found = list(prints())

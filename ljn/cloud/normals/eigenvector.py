@@ -45,3 +45,45 @@ def smallest_eigenvector(
         return 0.0, 0.0, 0.0
     length = math.sqrt(best)
     return nx / length, ny / length, nz / length
+
+
+@numba.njit(cache=True, nogil=True)
+def towards_camera(x: float, y: float, z: float) -> tuple[float, float, float]:
+    """Unit vector from a point to the camera; (0, 0, -1) at the camera itself."""
+    length = math.sqrt(x * x + y * y + z * z)
+    if length == 0.0:
+        return 0.0, 0.0, -1.0
+    return -x / length, -y / length, -z / length
+
+
+@numba.njit(cache=True, nogil=True)
+def plane_normal(
+    n: int,
+    sums: tuple[float, float, float],
+    products: tuple[float, float, float, float, float, float],
+    place: tuple[float, float, float],
+) -> tuple[float, float, float]:
+    """Unit normal, towards the camera, of the plane that fits points best; where none does, the camera's direction.
+
+    Args:
+        n: Number of points.
+        sums: Of their x, y and z relative to `place`.
+        products: Sums of xx, xy, xz, yy, yz and zz.
+        place: The point whose normal it is, metres, camera frame.
+    """
+    sx, sy, sz = sums
+    sxx, sxy, sxz, syy, syz, szz = products
+    x0, y0, z0 = place
+    nx, ny, nz = smallest_eigenvector(
+        sxx / n - sx * sx / n / n,
+        sxy / n - sx * sy / n / n,
+        sxz / n - sx * sz / n / n,
+        syy / n - sy * sy / n / n,
+        syz / n - sy * sz / n / n,
+        szz / n - sz * sz / n / n,
+    )
+    if nx == 0.0 and ny == 0.0 and nz == 0.0:
+        return towards_camera(x0, y0, z0)
+    if nx * x0 + ny * y0 + nz * z0 > 0.0:
+        return -nx, -ny, -nz
+    return nx, ny, nz

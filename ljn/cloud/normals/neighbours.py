@@ -5,7 +5,7 @@ import math
 import numba
 import numpy as np
 
-from ljn.cloud.normals.eigenvector import smallest_eigenvector
+from ljn.cloud.normals.eigenvector import plane_normal
 from ljn.cloud.sampling import Cloud
 from ljn.geometry.camera import Camera
 from ljn.optional import import_open3d
@@ -85,7 +85,7 @@ def _knn_normals(points: np.ndarray, k: int) -> np.ndarray:
                 reach *= 2
                 block, num_block = private, _copy_block(points, start, shape, cell, reach, private)
             _choose_nearest(squared[:num_block], k, limit, num_within, chosen)
-            normal = _plane_normal(block, chosen[:k], place)
+            normal = _fit_plane(block, chosen[:k], place)
             normals[order[i], 0], normals[order[i], 1], normals[order[i], 2] = normal
     return normals
 
@@ -300,7 +300,7 @@ def _choose_nearest(squared: np.ndarray, k: int, limit: float, num_within: int, 
 
 
 @numba.njit(cache=True, nogil=True)
-def _plane_normal(
+def _fit_plane(
     block: np.ndarray, chosen: np.ndarray, place: tuple[float, float, float]
 ) -> tuple[float, float, float]:
     """Unit normal, towards the camera, of the plane through the chosen points of `block` around `place`."""
@@ -319,19 +319,4 @@ def _plane_normal(
         syy += y * y
         syz += y * z
         szz += z * z
-    nx, ny, nz = smallest_eigenvector(
-        sxx / n - sx * sx / n / n,
-        sxy / n - sx * sy / n / n,
-        sxz / n - sx * sz / n / n,
-        syy / n - sy * sy / n / n,
-        syz / n - sy * sz / n / n,
-        szz / n - sz * sz / n / n,
-    )
-    if nx == 0.0 and ny == 0.0 and nz == 0.0:
-        length = math.sqrt(x0 * x0 + y0 * y0 + z0 * z0)
-        if length == 0.0:
-            return 0.0, 0.0, -1.0
-        return -x0 / length, -y0 / length, -z0 / length
-    if nx * x0 + ny * y0 + nz * z0 > 0.0:
-        return -nx, -ny, -nz
-    return nx, ny, nz
+    return plane_normal(n, (sx, sy, sz), (sxx, sxy, sxz, syy, syz, szz), place)

@@ -1,11 +1,9 @@
 """Normals from the depth image: a plane in a window around each point's pixel."""
 
-import math
-
 import numba
 import numpy as np
 
-from ljn.cloud.normals.eigenvector import smallest_eigenvector
+from ljn.cloud.normals.eigenvector import plane_normal, towards_camera
 from ljn.cloud.sampling import Cloud
 from ljn.geometry.camera import Camera
 
@@ -77,19 +75,10 @@ def _window_normals(
                 szz += z * z
         # Exact, in integers: the rays of a line of pixels lie in one plane, and noise would fit just that plane.
         is_line = (count * suu - su * su) * (count * svv - sv * sv) == (count * suv - su * sv) ** 2
-        n = max(count, 1)
-        nx, ny, nz = smallest_eigenvector(
-            sxx / n - sx * sx / n / n,
-            sxy / n - sx * sy / n / n,
-            sxz / n - sx * sz / n / n,
-            syy / n - sy * sy / n / n,
-            syz / n - sy * sz / n / n,
-            szz / n - sz * sz / n / n,
-        )
-        if is_line or (nx == 0.0 and ny == 0.0 and nz == 0.0):
-            length = math.sqrt(x0 * x0 + y0 * y0 + z0 * z0)
-            nx, ny, nz = -x0 / length, -y0 / length, -z0 / length
-        elif nx * x0 + ny * y0 + nz * z0 > 0.0:
-            nx, ny, nz = -nx, -ny, -nz
+        if is_line:
+            nx, ny, nz = towards_camera(x0, y0, z0)
+        else:
+            products = (sxx, sxy, sxz, syy, syz, szz)
+            nx, ny, nz = plane_normal(max(count, 1), (sx, sy, sz), products, (x0, y0, z0))
         normals[i, 0], normals[i, 1], normals[i, 2] = nx, ny, nz
     return normals
