@@ -111,6 +111,7 @@ def test_a_value_of_the_wrong_type_is_rejected(compose_config):
         (["data.eval_seed=-1"], r"data\.eval_seed: expected an integer of 0 or more, got -1"),
         (["num_threads=-2"], r"num_threads: expected 1 or more, or null, got -2"),
         (["paths.cache_dir=/dev/null/x"], r"paths\.cache_dir: cannot write in '/dev/null/x'"),
+        (["input=depth.png"], r"input: only task=predict reads this; add task=predict"),
         (["callbacks.best.monitor=val/mjpe"], r"callbacks\.best\.monitor: no metric 'val/mjpe'.*val/mpjpe"),
         (["model._target_=os.system"], r"model: `_target_: os\.system` is outside the modules"),
         (
