@@ -15,12 +15,12 @@ from datamodules.cache import cached_samples
 from datamodules.sources import PoseRecords, PoseSource
 from datamodules.synthesis import DepthSynthesizer, SynthesisSettings, concatenate
 from ljn.body import BodyModel, load_body_models
+from ljn.checkpoints import Checkpoint, load_module
 from ljn.cloud.normals import get_normal_estimator
 from ljn.data import EMBEDDED_DATA_VERSION, SPLITS, Batch, BodyDataModule
 from ljn.geometry.camera import Camera
 from ljn.modules.joint_detector import JointDetector
 from ljn.render import get_renderer
-from ljn.tasks.checkpoints import Checkpoint, load_module
 
 _LOG = logging.getLogger(__name__)
 _CHUNK = 16
@@ -159,14 +159,14 @@ class SyntheticDepthDataModule(BodyDataModule):
         """The source's licence; see `BodyDataModule`."""
         return self.source.licence
 
-    def examples(self, num_samples: int) -> tuple[Batch, Tensor]:
+    def examples(self, split: str, indices: Sequence[int]) -> tuple[Batch, Tensor]:
         """See `BodyDataModule`."""
-        if num_samples > self.sizes["train"]:
+        if not all(0 <= index < self.sizes[split] for index in indices):
             raise ValueError(
-                f"num_samples: there are {self.sizes['train']} training samples, got {num_samples}; ask for fewer, "
-                "or raise data.num_train"
+                f"examples: the {split} set has {self.sizes[split]} samples, got {list(indices)}; ask for fewer, or "
+                f"raise data.num_{split}"
             )
-        batch, depth = self._train_synthesizer().examples([(0, index) for index in range(num_samples)])
+        batch, depth = self._synthesizer(split).examples([(0, index) for index in indices])
         return self.on_after_batch_transfer(batch, 0), depth
 
     def describe(self, splits: Sequence[str] = SPLITS) -> dict[str, Any]:
@@ -217,7 +217,7 @@ class SyntheticDepthDataModule(BodyDataModule):
     def setup(self, stage: str) -> None:
         """Build the sets that a stage (`fit`, `validate` or `test`) needs."""
         if stage == "fit" and self._train is None:
-            self._train = self._train_synthesizer()
+            self._train = self._synthesizer("train")
         needed = {"fit": ["val"], "validate": ["val"], "test": ["test"]}[stage]
         for split in needed:
             if split not in self._fixed:
@@ -228,9 +228,15 @@ class SyntheticDepthDataModule(BodyDataModule):
             self._records[split] = self.source.records(split, self.sizes[split], self.pool_seed)
         return self._records[split]
 
-    def _train_synthesizer(self) -> DepthSynthesizer:
-        seed_key = (self.seed, SPLITS.index("train"))
-        return DepthSynthesizer(self._records_of("train"), self.bodies, self.settings, seed_key)
+    def _synthesizer(self, split: str) -> DepthSynthesizer:
+        is_train = split == "train"
+        return DepthSynthesizer(
+            self._records_of(split),
+            self.bodies,
+            self.settings,
+            (self.seed if is_train else self.eval_seed, SPLITS.index(split)),
+            torch.float32 if is_train else torch.float64,
+        )
 
     def train_dataloader(self) -> DataLoader:
         """Samples rendered as they are needed; the last, incomplete batch is dropped."""
@@ -257,15 +263,12 @@ class SyntheticDepthDataModule(BodyDataModule):
     def _fixed_samples(self, split: str) -> dict[str, Tensor]:
         def make() -> dict[str, Tensor]:
             _LOG.info("rendering %d %s samples", self.sizes[split], split)
-            records = self._records_of(split)
-            synthesizer = DepthSynthesizer(
-                records, self.bodies, self.settings, (self.eval_seed, SPLITS.index(split)), torch.float64
-            )
+            synthesizer = self._synthesizer(split)
             # Chunks of one size whatever the batch size: the body's products then round alike.
-            keys = [(0, index) for index in range(len(records))]
+            keys = [(0, index) for index in range(self.sizes[split])]
             chunks = [keys[start : start + _CHUNK] for start in range(0, len(keys), _CHUNK)]
             batches = self._loader(SynthesizedSamples(synthesizer), chunks, persistent=False)
-            return concatenate(batches, len(records))
+            return concatenate(batches, len(keys))
 
         return cached_samples(self.cache_dir, self.fixed_key(split), make)
 

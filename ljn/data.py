@@ -68,8 +68,14 @@ class BodyDataModule(LightningDataModule):
         """Where the data comes from and what may be done with it: goes into checkpoints."""
 
     @abstractmethod
-    def examples(self, num_samples: int) -> tuple[Batch, Tensor]:
-        """The first training samples, and the depth images `(B, H, W)`, metres, that they were taken from."""
+    def examples(self, split: str, indices: Sequence[int]) -> tuple[Batch, Tensor]:
+        """Samples of a split by their numbers, and the depth images `(B, H, W)`, metres, that they were taken from.
+
+        Training samples are those of the first epoch.
+
+        Raises:
+            ValueError: The split has no such sample.
+        """
 
     @abstractmethod
     def describe(self, splits: Sequence[str] = SPLITS) -> dict[str, Any]:

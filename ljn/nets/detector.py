@@ -19,9 +19,14 @@ class Detector(nn.Module, ABC):
     Everything is centred on the cloud's mean first, so a detector does not see where the person stands.
     Subclasses implement `regress` in that frame.
 
+    Attributes:
+        is_root_relative: Whether only its joints' positions beside the root mean something.
+
     Args:
         output: `offset`: `regress` gives offsets to the initial joints; `absolute`: positions.
     """
+
+    is_root_relative = False
 
     def __init__(self, output: str = "offset") -> None:
         super().__init__()

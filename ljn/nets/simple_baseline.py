@@ -21,6 +21,8 @@ class SimpleBaseline(Detector):
         dropout: Share of the hidden values that are dropped in training.
     """
 
+    is_root_relative = True
+
     def __init__(self, channels: int = 1024, num_blocks: int = 2, dropout: float = 0.5) -> None:
         super().__init__(output="offset")
 

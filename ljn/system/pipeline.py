@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from ljn.body.skeleton import ROOT
+from ljn.checkpoints import Checkpoint, load_module
 from ljn.cloud.keypoints import lift_keypoints
 from ljn.cloud.normals import get_normal_estimator
 from ljn.cloud.sampling import sample_cloud
@@ -18,7 +19,6 @@ from ljn.modules.joint_detector import JointDetector
 from ljn.modules.mesh_regressor import MeshRegressor
 from ljn.system.depth import body_depth
 from ljn.system.keypoints import check_place, smpl_keypoints
-from ljn.tasks.checkpoints import Checkpoint, load_module
 
 _SEED = 0  # of the choice of points: the same for every image, so that equal input gives equal output
 

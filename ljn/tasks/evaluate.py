@@ -8,10 +8,10 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
 
+from ljn.building import build, check_targets
+from ljn.checkpoints import CONFIG_GROUPS, Checkpoint, load_state, read_checkpoint
 from ljn.data import BodyDataModule
 from ljn.tasks import records
-from ljn.tasks.building import build, check_targets
-from ljn.tasks.checkpoints import CONFIG_GROUPS, Checkpoint, load_state, read_checkpoint
 from ljn.tasks.tracking import tracking
 from ljn.tasks.train import (
     build_trainer,
@@ -74,7 +74,7 @@ def evaluate(cfg: DictConfig) -> dict[str, float]:
     prepare_process(cfg)
     module = build(cfg.module)
     load_state(module, checkpoint)
-    _check_bodies(checkpoint, {body.hash for body in datamodule.bodies} | set(module.body_hashes))
+    check_bodies(checkpoint, {body.hash for body in datamodule.bodies} | set(module.body_hashes))
     facts = {
         "name": cfg.name,
         "preset": cfg.preset.name,
@@ -95,7 +95,8 @@ def evaluate(cfg: DictConfig) -> dict[str, float]:
     return metrics
 
 
-def _check_bodies(checkpoint: Checkpoint, hashes: set[str]) -> None:
+def check_bodies(checkpoint: Checkpoint, hashes: set[str]) -> None:
+    """Raise a `ValueError` unless a checkpoint was trained with the bodies of these hashes."""
     if unknown := checkpoint.unknown_bodies(hashes):
         raise ValueError(
             f"body: the checkpoint was trained with the bodies {checkpoint.body_hash}; {unknown[0]} is not among "

@@ -5,9 +5,9 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 
+from ljn.building import build
 from ljn.data import BodyDataModule
 from ljn.drawing import draw_examples
-from ljn.tasks.building import build
 from ljn.tasks.train import prepare_process
 from ljn.tasks.validation import validate
 
@@ -31,7 +31,7 @@ def show(cfg: DictConfig) -> dict[str, float]:
     prepare_process(cfg)
     datamodule: BodyDataModule = build(cfg.data)
     datamodule.prepare_data()
-    batch, depth = datamodule.examples(cfg.task.num_samples)
+    batch, depth = datamodule.examples("train", range(cfg.task.num_samples))
     path = Path(cfg.paths.output_dir) / "show.png"
     draw_examples(batch, depth).savefig(path)
     _LOG.info("%d samples: %s", len(depth), path)

@@ -11,11 +11,11 @@ import lightning.pytorch as lightning
 import torch
 from omegaconf import DictConfig, OmegaConf, open_dict
 
+from ljn.building import build, build_each
+from ljn.checkpoints import AtomicCheckpointIO, Provenance, read_checkpoint
 from ljn.data import BodyDataModule
 from ljn.modules.base import StageModule
 from ljn.tasks import records
-from ljn.tasks.building import build, build_each
-from ljn.tasks.checkpoints import AtomicCheckpointIO, Provenance, read_checkpoint
 from ljn.tasks.tracking import tracking
 from ljn.tasks.validation import validate
 

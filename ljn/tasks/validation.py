@@ -9,7 +9,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from ljn.body.skeleton import JOINT_NAMES, NUM_JOINTS
-from ljn.tasks.building import check_targets
+from ljn.building import check_targets
 
 
 def validate(cfg: DictConfig) -> None:

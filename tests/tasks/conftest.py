@@ -75,23 +75,31 @@ def trained(smoke_config, tmp_path_factory):
 
 
 @pytest.fixture(scope="session")
-def checkpoints(smoke_config, tmp_path_factory):
-    """Checkpoints of an untrained joint detector and an untrained mesh regressor, written as by a run."""
+def write_checkpoint(smoke_config, tmp_path_factory):
+    """Write the checkpoint of an experiment's untrained module as a run does; returns its path."""
     from ljn.body import load_body_models
-    from ljn.tasks.building import build
-    from ljn.tasks.checkpoints import Provenance
+    from ljn.building import build
+    from ljn.checkpoints import Provenance
 
-    directory = tmp_path_factory.mktemp("checkpoints")
     data_hashes = [body.hash for body in load_body_models(None, ["female", "male"])]
-    torch.manual_seed(0)
-    paths = []
-    for experiment in ("detector/proposed", "mesh/proposed"):
-        cfg = smoke_config(directory, f"experiment={experiment}", f"paths.run_dir={directory}")
+
+    def make(experiment, *overrides):
+        directory = tmp_path_factory.mktemp("checkpoint")
+        cfg = smoke_config(directory, f"experiment={experiment}", f"paths.run_dir={directory}", *overrides)
+        torch.manual_seed(0)
         module = build(cfg.module)
         content = {"state_dict": module.state_dict(), "epoch": 0}
         config = OmegaConf.to_container(cfg, resolve=True)
         body_hash = "-".join(sorted({*data_hashes, *module.body_hashes}))
         Provenance(config, body_hash, "none", experiment).on_save_checkpoint(None, module, content)
-        paths.append(directory / f"{experiment.split('/')[0]}.ckpt")
-        torch.save(content, paths[-1])
-    return paths
+        path = directory / f"{experiment.replace('/', '_')}.ckpt"
+        torch.save(content, path)
+        return path
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def checkpoints(write_checkpoint):
+    """Checkpoints of an untrained joint detector and an untrained mesh regressor."""
+    return [write_checkpoint("detector/proposed"), write_checkpoint("mesh/proposed")]

@@ -5,7 +5,7 @@ import pytest
 from hydra.errors import ConfigCompositionException
 from omegaconf import OmegaConf, open_dict
 
-from ljn.tasks.building import build, build_each, check_targets
+from ljn.building import build, build_each, check_targets
 from ljn.tasks.validation import check_writable, validate
 
 CONF = Path(__file__).parents[2] / "conf"

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from ljn.tasks.checkpoints import read_checkpoint
+from ljn.checkpoints import read_checkpoint
 from ljn.tasks.evaluate import evaluate, with_checkpoint_config
 
 

@@ -178,8 +178,8 @@ def test_a_damaged_checkpoint_to_resume_from_is_named(smoke_config, tmp_path):
 
 
 def test_another_content_of_the_pose_file_is_another_run(smoke_config, tmp_path):
+    from ljn.building import build
     from ljn.tasks import records
-    from ljn.tasks.building import build
 
     hashes = []
     for value in (0.0, 0.1):

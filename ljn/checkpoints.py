@@ -12,11 +12,10 @@ from typing import Any
 import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.plugins.io import TorchCheckpointIO
-from omegaconf import OmegaConf
 from torch import Tensor
 
+from ljn.building import build
 from ljn.modules.base import StageModule
-from ljn.tasks.building import build
 
 CHECKPOINT_VERSION = 2
 _PROVENANCE_KEY = "ljn"
@@ -207,7 +206,7 @@ def load_module(path: str | Path, kind: type[StageModule], name: str = "ckpt_pat
         ValueError: See `read_checkpoint` and `load_state`; or the checkpoint is of another kind.
     """
     checkpoint = read_checkpoint(path)
-    module = build(OmegaConf.create(checkpoint.config["module"]))
+    module = build(checkpoint.config["module"])
     if not isinstance(module, kind):
         raise ValueError(
             f"{name}: expected the checkpoint of a {kind.__name__}, but '{path}' is that of a "

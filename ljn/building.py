@@ -53,13 +53,13 @@ def _check_target(target: str, where: str) -> None:
         )
 
 
-def build(config: DictConfig, **arguments: Any) -> Any:
-    """The object that a config node describes; `arguments` are added to the node's own.
+def build(config: DictConfig | Mapping[str, Any], **arguments: Any) -> Any:
+    """The object that a config node, or a plain one, describes; `arguments` are added to the node's own.
 
     Raises:
         ValueError: A `_target_` outside the allow-list, or arguments that the target does not take.
     """
-    check_targets(OmegaConf.to_container(config, resolve=True))
+    check_targets(OmegaConf.to_container(config, resolve=True) if OmegaConf.is_config(config) else config)
     try:
         return hydra.utils.instantiate(config, **arguments)
     except hydra.errors.InstantiationException as error:

@@ -1,0 +1,183 @@
+"""`task=figures`: Figures 3.12 and 3.13, the same test samples as several checkpoints see them."""
+
+import logging
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from omegaconf import DictConfig
+
+from ljn.body.skeleton import ROOT
+from ljn.building import build
+from ljn.checkpoints import load_module
+from ljn.data import Batch, BodyDataModule
+from ljn.drawing import MeshSample, Sample, draw_meshes, draw_samples
+from ljn.metrics import mpjpe
+from ljn.modules.joint_detector import JointDetector
+from ljn.modules.mesh_regressor import MeshRegressor
+from ljn.tasks.evaluate import check_bodies, with_checkpoint_config
+from ljn.tasks.records import write_json
+from ljn.tasks.train import prepare_process
+from ljn.tasks.validation import check_writable, validate
+
+_LOG = logging.getLogger(__name__)
+
+
+class Column(NamedTuple):
+    """A checkpoint in a figure.
+
+    Attributes:
+        title: What it is and what noise its initial joints have.
+        module: The trained module.
+        batch: The test samples with the initial joints that it gets.
+        facts: For `figures.json`.
+    """
+
+    title: str
+    module: Any
+    batch: Batch
+    facts: dict[str, Any]
+
+
+def figures(cfg: DictConfig) -> dict[str, float]:
+    """Draw the same test samples as several checkpoints see them, a column for each.
+
+    `output_dir/figures/joints.png` (Fig. 3.12) has true (blue) and predicted (red) skeletons, from the front and from
+    the side; `meshes.png` (Fig. 3.13) has predicted (red) and true (blue) meshes. The samples are spread evenly over
+    the test set, not chosen by hand; `figures.json` names them, with their errors and the checkpoints.
+
+    Args:
+        cfg: The composed configuration; of it `task`, `paths` and `num_threads` count. `task.detectors` and
+            `task.regressors` are lists of checkpoints; `task.keypoint_noise_px` gives the noise of each detector's
+            keypoints (null: that of its training); `task.num_samples` says how many samples to draw.
+
+    Returns:
+        The mean error of the drawn samples in each column, as `figures/joints_0` and so on, mm: MPJPE (root-aligned
+        for a detector whose joints only mean something beside the root) and APVE.
+
+    Raises:
+        ValueError: No checkpoint is given, one is of the other stage, or their test sets differ.
+        FileNotFoundError: There is no such checkpoint.
+    """
+    detectors, regressors = list(cfg.task.detectors), list(cfg.task.regressors)
+    if not detectors and not regressors:
+        raise ValueError(
+            "task.detectors, task.regressors: expected checkpoints, got none; python run.py task=figures "
+            "'task.detectors=[PROPOSED.ckpt,BASELINE.ckpt]' 'task.regressors=[MESH.ckpt]'"
+        )
+    noise = (
+        [None] * len(detectors) if cfg.task.keypoint_noise_px is None else list(cfg.task.keypoint_noise_px)
+    )
+    if len(noise) != len(detectors):
+        raise ValueError(
+            f"task.keypoint_noise_px: expected one value for each of the {len(detectors)} detectors, got {noise}"
+        )
+    if cfg.task.num_samples < 1:
+        raise ValueError(f"task.num_samples: expected at least 1, got {cfg.task.num_samples}")
+    directory = Path(cfg.paths.output_dir) / "figures"
+    check_writable(directory)
+
+    pages: dict[str, list[Column]] = {"joints": [], "meshes": []}
+    for path, noise_px in zip(detectors, noise):
+        overrides = [] if noise_px is None else [f"data.keypoint_noise_px={noise_px}"]
+        pages["joints"].append(_column(cfg, path, JointDetector, "task.detectors", overrides))
+    for path in regressors:
+        pages["meshes"].append(_column(cfg, path, MeshRegressor, "task.regressors", []))
+    _check_same_samples([column for columns in pages.values() for column in columns])
+
+    metrics: dict[str, float] = {}
+    said: dict[str, Any] = {}
+    for page, columns in pages.items():
+        if not columns:
+            continue
+        draw = _draw_joints if page == "joints" else _draw_meshes
+        figure, errors = draw(columns)
+        figure.savefig(directory / f"{page}.png")
+        said[page] = [
+            column.facts | {"title": column.title, "errors_mm": error.tolist()}
+            for column, error in zip(columns, errors)
+        ]
+        metrics |= {f"figures/{page}_{number}": float(error.mean()) for number, error in enumerate(errors)}
+        _LOG.info("%d samples: %s", len(errors[0]), directory / f"{page}.png")
+    write_json(directory / "figures.json", said)
+    return metrics
+
+
+def _column(cfg: DictConfig, path: str, kind: type, key: str, overrides: Sequence[str]) -> Column:
+    """A checkpoint and the test samples as it gets them."""
+    module, checkpoint = load_module(path, kind, key)
+    own = with_checkpoint_config(cfg, checkpoint, list(overrides))
+    validate(own)
+    prepare_process(own)
+    datamodule: BodyDataModule = build(own.data)
+    datamodule.prepare_data()
+    check_bodies(checkpoint, {body.hash for body in datamodule.bodies} | set(module.body_hashes))
+    num_test, wanted = own.data.num_test, cfg.task.num_samples
+    if wanted > num_test:
+        raise ValueError(
+            f"task.num_samples: '{path}' has {num_test} test samples, got {wanted}; ask for fewer"
+        )
+    # The middles of equal parts of the test set.
+    indices = [(2 * number + 1) * num_test // (2 * wanted) for number in range(wanted)]
+    batch, _ = datamodule.examples("test", indices)
+    source = own.data.initial_joints
+    initial = {"lifted": f"{own.data.keypoint_noise_px:g} px", "noised": f"{own.data.joint_noise_m:g} m"}
+    facts = {"checkpoint": str(checkpoint.path), "hash": checkpoint.file_hash, "run": checkpoint.run}
+    return Column(
+        f"{own.name}, {initial.get(source, source)}",
+        module,
+        batch,
+        facts | {"samples": batch["sample_id"].tolist()},
+    )
+
+
+def _check_same_samples(columns: Sequence[Column]) -> None:
+    first = columns[0]
+    for column in columns[1:]:
+        same = [
+            torch.equal(column.batch[name], first.batch[name]) for name in ("sample_id", "pose", "joints")
+        ]
+        if not all(same):
+            raise ValueError(
+                f"task.detectors, task.regressors: the test sets of '{first.facts['checkpoint']}' and "
+                f"'{column.facts['checkpoint']}' differ (data.num_test, data.pool_seed, data.eval_seed, camera or "
+                "body); a figure compares the same samples"
+            )
+
+
+@torch.no_grad()
+def _draw_joints(columns: Sequence[Column]) -> tuple[Any, list[torch.Tensor]]:
+    drawn, errors = [], []
+    for title, module, batch, _ in columns:
+        joints = batch["joints"]
+        predicted = module.evaluate(batch, module.test_metrics)["pred_joints"]
+        if module.net.is_root_relative:
+            predicted = predicted + (joints - predicted)[:, ROOT, None]
+            title = f"{title}, root-aligned"
+        error = mpjpe(predicted, joints)
+        errors.append(error)
+        titles = [f"{title}: {value:.0f} mm" for value in error]
+        arrays = (values.numpy() for values in (batch["points"][..., :3], joints, predicted))
+        drawn.append([Sample(*row) for row in zip(*arrays, titles)])
+    return draw_samples(_by_rows(drawn), len(columns)), errors
+
+
+@torch.no_grad()
+def _draw_meshes(columns: Sequence[Column]) -> tuple[Any, list[torch.Tensor]]:
+    drawn, errors = [], []
+    for title, module, batch, _ in columns:
+        seen = module.evaluate(batch, module.test_metrics)
+        errors.append(seen["apve"])
+        titles = [f"{title}: {value:.0f} mm" for value in seen["apve"]]
+        arrays = (
+            values.numpy() for values in (batch["points"][..., :3], seen["vertices"], seen["pred_vertices"])
+        )
+        drawn.append([MeshSample(*row) for row in zip(*arrays, titles)])
+    faces = columns[0].module.body.faces.numpy()
+    return draw_meshes(_by_rows(drawn), faces, len(columns)), errors
+
+
+def _by_rows(columns: list[list[Any]]) -> list[Any]:
+    """Columns of samples in reading order."""
+    return [sample for row in zip(*columns) for sample in row]
