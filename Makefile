@@ -9,7 +9,7 @@ demo: install
 	$(BIN)/python run.py sweep=demo
 
 test: install
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n auto --dist worksteal
 
 lint: install
 	$(BIN)/ruff check .

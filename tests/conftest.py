@@ -1,4 +1,5 @@
 import itertools
+import os
 
 import numpy as np
 import pytest
@@ -12,6 +13,10 @@ from ljn.geometry.camera import Camera
 from ljn.geometry.rotations import CAMERA_FROM_BODY, rotation_about, rotmat_to_rotvec, rotvec_to_rotmat
 from ljn.optional import import_open3d, import_pyrender
 from ljn.render import get_renderer
+
+if "PYTEST_XDIST_WORKER" in os.environ:
+    # With several threads in each worker, they would wait for one another's cores.
+    torch.set_num_threads(1)
 
 
 @pytest.fixture(scope="session")

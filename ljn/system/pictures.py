@@ -4,8 +4,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ljn.body.skeleton import BONES, ROOT
-from ljn.drawing import FROM_THE_SIDE, new_figure, shade_mesh
+from ljn.body.skeleton import ROOT
+from ljn.drawing import FROM_THE_SIDE, bone_lines, new_figure, shade_mesh
 from ljn.geometry.camera import Camera
 from ljn.system.pipeline import Prediction
 
@@ -57,8 +57,7 @@ def draw_prediction(prediction: Prediction, depth: np.ndarray, camera: Camera) -
 def _draw_keypoints(axis: "Axes", prediction: Prediction, depth: np.ndarray) -> None:
     axis.imshow(np.where(depth > 0, depth, np.nan), cmap="viridis")
     keypoints, is_filled = prediction.keypoints, prediction.confidences == 0
-    for parent, joint in BONES:
-        axis.plot(*keypoints[[parent, joint]].T, color="white", lw=0.6)
+    axis.plot(*bone_lines(keypoints).T, color="white", lw=0.6)
     for chosen, colour in ((~is_filled, _PREDICTED), (is_filled, _FILLED)):
         axis.scatter(keypoints[chosen, 0], keypoints[chosen, 1], s=9, c=colour, zorder=3)
     _crop(axis, depth > 0, keypoints)
@@ -79,9 +78,8 @@ def _draw_skeletons(axis: "Axes", prediction: Prediction, horizontal: int) -> No
     points = prediction.points
     axis.scatter(points[:, horizontal], points[:, 1], s=2, c="#b9bec6", linewidths=0)
     for joints, colour in ((prediction.initial_joints, _INITIAL), (prediction.joints, _PREDICTED)):
-        for bone in BONES:
-            ends = joints[list(bone)]
-            axis.plot(ends[:, horizontal], ends[:, 1], color=colour, lw=1.6, solid_capstyle="round")
+        bones = bone_lines(joints)
+        axis.plot(bones[:, horizontal], bones[:, 1], color=colour, lw=1.6, solid_capstyle="round")
     axis.set_aspect("equal")
     axis.invert_yaxis()
     axis.set_axis_off()
