@@ -173,7 +173,9 @@ class DepthSynthesizer:
 
         depth = self._renderer(vertices, self._smpl.faces, camera).numpy()
         for image, (epoch, index) in zip(depth, keys):
-            image[:] = add_depth_noise(image, settings.depth_noise_m, self._rng(epoch, index, _DEPTH_NOISE))
+            add_depth_noise(
+                image, settings.depth_noise_m, self._rng(epoch, index, _DEPTH_NOISE), in_place=True
+            )
         return _Scene(pose, betas, gender, joints, depth)
 
     def _observe(self, keys: Sequence[tuple[int, int]], scene: "_Scene") -> Batch:

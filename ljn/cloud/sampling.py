@@ -20,15 +20,18 @@ class Cloud(NamedTuple):
     pixels: np.ndarray
 
 
-def add_depth_noise(depth: np.ndarray, noise_std_m: float, rng: np.random.Generator) -> np.ndarray:
-    """A copy of a depth image with Gaussian noise on the body's pixels (section 3.6.1).
+def add_depth_noise(
+    depth: np.ndarray, noise_std_m: float, rng: np.random.Generator, in_place: bool = False
+) -> np.ndarray:
+    """A depth image with Gaussian noise on the body's pixels (section 3.6.1).
 
     Args:
         depth: `(H, W)` float32, metres; 0 is background and stays 0.
         noise_std_m: Standard deviation, metres.
         rng: Source of the draws; they do not depend on `noise_std_m`.
+        in_place: Whether `depth` itself gets the noise, or a copy.
     """
-    noisy = depth.copy()
+    noisy = depth if in_place else depth.copy()
     flat = noisy.reshape(-1)
     foreground = np.flatnonzero(flat > 0)
     flat[foreground] += np.float32(noise_std_m) * rng.standard_normal(len(foreground), dtype=np.float32)

@@ -21,10 +21,12 @@ def _rasterise(
     cy: float,
     depth: np.ndarray,
     face_ids: np.ndarray | None,
+    buffer: np.ndarray,
 ) -> None:
     """Write planar depth into `depth` `(H, W)`, which must be zero, and what is seen into `face_ids` `(H, W)`.
 
-    `face_ids` may be None: numba then compiles a version without it.
+    `face_ids` may be None: numba then compiles a version without it. `buffer` is float64 scratch of the image's size,
+    zero before and after.
 
     Inverse depth is affine in the image, so it is interpolated with the edge functions and the largest wins.
     Each edge function is computed from its two end points alone: neighbours get it with the opposite sign to
@@ -40,7 +42,6 @@ def _rasterise(
         inverse[i] = 1.0 / vertices[i, 2]
         us[i] = vertices[i, 0] * inverse[i] * fx + cx
         vs[i] = vertices[i, 1] * inverse[i] * fy + cy
-    buffer = np.zeros((height, width))
     for f in range(faces.shape[0]):
         a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
         ua, va, ub, vb, uc, vc = us[a], vs[a], us[b], vs[b], us[c], vs[c]
@@ -79,6 +80,7 @@ def _rasterise(
         for u in range(left, right + 1):
             if buffer[v, u] > 0.0:
                 depth[v, u] = 1.0 / buffer[v, u]
+                buffer[v, u] = 0.0
 
 
 @numba.njit(cache=True, nogil=True)
@@ -121,8 +123,9 @@ class ZBuffer(Renderer):
         """See `ljn.render.Renderer`."""
         meshes, face_array = _as_arrays(vertices, faces)
         depth = np.zeros((len(meshes), camera.height, camera.width), np.float32)
+        buffer = np.zeros((camera.height, camera.width))
         for mesh, image in zip(meshes, depth):
-            _rasterise(mesh, face_array, camera.fx, camera.fy, camera.cx, camera.cy, image, None)
+            _rasterise(mesh, face_array, camera.fx, camera.fy, camera.cx, camera.cy, image, None, buffer)
         return torch.from_numpy(depth)
 
     def fragments(self, vertices: Tensor, faces: Tensor, camera: Camera) -> Fragments:
@@ -132,8 +135,9 @@ class ZBuffer(Renderer):
         depth, face_ids = np.zeros(size, np.float32), np.full(size, -1)
         barycentrics = np.zeros((*size, 3), np.float32)
         intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy)
+        buffer = np.zeros((camera.height, camera.width))
         for mesh, image, ids, weights in zip(meshes, depth, face_ids, barycentrics):
-            _rasterise(mesh, face_array, *intrinsics, image, ids)
+            _rasterise(mesh, face_array, *intrinsics, image, ids, buffer)
             _write_barycentrics(mesh, face_array, *intrinsics, ids, weights)
         return Fragments(*map(torch.from_numpy, (depth, face_ids, barycentrics)))
 

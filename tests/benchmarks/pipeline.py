@@ -1,7 +1,8 @@
 """How fast samples are made and a detector trains: `make bench`.
 
 One table from one run; ratios of speed are against the first row of each block. Whole samples come from two worker
-processes, everything else from one thread; medians.
+processes, everything else from one thread. Rows are timed in turn over several rounds, and times and ratios are medians
+over the rounds: a machine that changes its speed changes it for all rows of a round.
 """
 
 import statistics
@@ -28,33 +29,34 @@ from ljn.nets.layers import StackedLinear, StackedPReLU
 from ljn.render import get_renderer
 
 CAMERA = Camera(fx=366.458, fy=366.736, cx=206.470, cy=253.026, width=424, height=512)
-BATCH, NUM_POINTS, REPEATS = 16, 4096, 15
-ROUNDS, BATCHES, WARM_UP = 3, 16, 6
-"""Of the whole samples: each row is timed in turn, over so many batches, after the workers' first ones."""
+BATCH, NUM_POINTS = 16, 4096
+ROUNDS, BATCHES = 7, 8
+"""Of whole samples, `BATCHES` are timed in each round."""
 
 
-def median_ms(call: Callable[[], object], per: int = BATCH) -> float:
-    """Median milliseconds of a call, divided by the samples that it handles; after one that does not count."""
-    call()
-    times = []
-    for _ in range(REPEATS):
-        start = time.perf_counter()
+def time_rows(
+    title: str, rows: dict[str, Callable[[], object]], per_call: int = BATCH, rounds: int = 15
+) -> None:
+    """Time each row's call, which handles `per_call` samples, and print a block of the table."""
+    for call in rows.values():
         call()
-        times.append(time.perf_counter() - start)
-    return 1000 * statistics.median(times) / per
+    found: dict[str, list[float]] = {name: [] for name in rows}
+    for _ in range(rounds):
+        for name, call in rows.items():
+            start = time.perf_counter()
+            call()
+            found[name].append(1000 * (time.perf_counter() - start) / per_call)
+    print_rows(title, found)
 
 
-def print_rows(title: str, ms_per_sample: dict[str, float]) -> None:
-    """A block of the table: each row beside how many times faster than it the first row is."""
+def print_rows(title: str, rounds: dict[str, list[float]]) -> None:
+    """A block of the table: each row's milliseconds, and how many times faster than it the first row is."""
     print(f"\n{title:48s}{'ms/sample':>10s}{'samples/s':>11s}{'first is':>10s}", flush=True)
-    first = next(iter(ms_per_sample.values()))
-    for name, value in ms_per_sample.items():
-        print(f"  {name:46s}{value:10.2f}{1000 / value:11.0f}{value / first:9.2f}x", flush=True)
-
-
-def time_rows(title: str, rows: dict[str, Callable[[], object]]) -> None:
-    """Time each row and print them."""
-    print_rows(title, {name: median_ms(call) for name, call in rows.items()})
+    first = next(iter(rounds.values()))
+    for name, values in rounds.items():
+        ms = statistics.median(values)
+        ratio = statistics.median(value / of_first for value, of_first in zip(values, first))
+        print(f"  {name:46s}{ms:10.2f}{1000 / ms:11.0f}{ratio:9.2f}x", flush=True)
 
 
 class OfPosedBodies(DepthSynthesizer):
@@ -78,30 +80,38 @@ class PosedBodies:
 
 
 def time_loaders(title: str, synthesizers: dict[str, DepthSynthesizer]) -> None:
-    """Time whole samples as they come from two workers, the rows in turn, and print them."""
-    batches = [list(range(BATCH))] * (WARM_UP + BATCHES)
-    keys = [[(0, index) for index in batch] for batch in batches]
+    """Time whole samples as they come from two workers and print a block of the table.
+
+    All rows' workers live through all rounds; those of a row that is not being timed have batches ready and wait.
+    """
+    ready = 2 * 2  # workers, each with one batch made and one begun
+    keys = [[(0, index) for index in range(BATCH)]] * (ROUNDS + 1) * (ready + BATCHES)
+    arriving: dict[str, Iterator[object]] = {}
+    for name, synthesizer in synthesizers.items():
+        loader = DataLoader(
+            SynthesizedSamples(synthesizer),
+            batch_sampler=keys,
+            collate_fn=_as_is,
+            num_workers=2,
+            prefetch_factor=1,
+            multiprocessing_context="spawn" if synthesizer.settings.renderer == "pyrender" else "fork",
+        )
+        arriving[name] = iter(loader)
+    for batches in arriving.values():
+        for _ in range(ready):
+            next(batches)
     found: dict[str, list[float]] = {name: [] for name in synthesizers}
     for _ in range(ROUNDS):
-        for name, synthesizer in synthesizers.items():
-            uses_gl = synthesizer.settings.renderer == "pyrender"
-            loader = DataLoader(
-                SynthesizedSamples(synthesizer),
-                batch_sampler=keys,
-                collate_fn=_as_is,
-                num_workers=2,
-                prefetch_factor=1,  # nothing is ready in advance when the clock starts
-                multiprocessing_context="spawn" if uses_gl else "fork",
-            )
-            arriving: Iterator[object] = iter(loader)
-            for _ in range(WARM_UP):
-                next(arriving)
+        for name, batches in arriving.items():
+            for _ in range(ready):
+                next(batches)
             start = time.perf_counter()
             for _ in range(BATCHES):
-                next(arriving)
-            found[name].append(1000 * (time.perf_counter() - start) / (BATCHES * BATCH))
-            del arriving
-    print_rows(title, {name: statistics.median(values) for name, values in found.items()})
+                next(batches)
+            seconds = time.perf_counter() - start
+            found[name].append(1000 * seconds / (BATCHES * BATCH))
+            time.sleep(1.5 * ready * seconds / BATCHES)  # until its workers wait, too
+    print_rows(title, found)
 
 
 def _as_is(batch: Any) -> Any:

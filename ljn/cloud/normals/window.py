@@ -40,12 +40,15 @@ def _window_normals(
     cy: float,
 ) -> np.ndarray:
     height, width = depth.shape
+    # Divided once for each column and row: the same bits as for each neighbour, in less time.
+    x_slopes = (np.arange(width) - cx) / fx
+    y_slopes = (np.arange(height) - cy) / fy
     normals = np.empty((len(pixels), 3), np.float32)
     for i in range(len(pixels)):
         u, v = pixels[i, 0], pixels[i, 1]
         z0 = float(depth[v, u])
-        x0 = (u - cx) / fx * z0
-        y0 = (v - cy) / fy * z0
+        x0 = x_slopes[u] * z0
+        y0 = y_slopes[v] * z0
         count = su = sv = suu = suv = svv = 0
         sx = sy = sz = sxx = sxy = sxz = syy = syz = szz = 0.0
         for row in range(max(v - radius, 0), min(v + radius + 1, height)):
@@ -54,8 +57,8 @@ def _window_normals(
                 if zn <= 0.0 or abs(zn - z0) > max_jump:
                     continue
                 # Relative to the central point: no cancellation far from the origin.
-                x = (column - cx) / fx * zn - x0
-                y = (row - cy) / fy * zn - y0
+                x = x_slopes[column] * zn - x0
+                y = y_slopes[row] * zn - y0
                 z = zn - z0
                 du, dv = column - u, row - v
                 count += 1
