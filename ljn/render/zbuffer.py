@@ -27,60 +27,88 @@ def _rasterise(
 
     `face_ids` may be None: numba then compiles a version without it. `buffer` is float64 scratch of the image's size,
     zero before and after.
-
-    Inverse depth is affine in the image, so it is interpolated with the edge functions and the largest wins.
-    Each edge function is computed from its two end points alone: neighbours get it with the opposite sign to
-    the last bit, so that no pixel falls through a shared edge.
     """
     height, width = depth.shape
-    num_vertices = vertices.shape[0]
-    us = np.empty(num_vertices)
-    vs = np.empty(num_vertices)
-    inverse = np.empty(num_vertices)
-    top, bottom, left, right = height, -1, width, -1
-    for i in range(num_vertices):
-        inverse[i] = 1.0 / vertices[i, 2]
-        us[i] = vertices[i, 0] * inverse[i] * fx + cx
-        vs[i] = vertices[i, 1] * inverse[i] * fy + cy
+    corners = np.empty((vertices.shape[0], 3))  # u, v, inverse depth
+    for i in range(vertices.shape[0]):
+        inverse = 1.0 / vertices[i, 2]
+        corners[i, 0] = vertices[i, 0] * inverse * fx + cx
+        corners[i, 1] = vertices[i, 1] * inverse * fy + cy
+        corners[i, 2] = inverse
+    # Faces turned away come last: what is before them then spares most of their work. Ids need the faces in their own
+    # order, which decides between equally near ones.
+    later = np.empty(faces.shape[0], np.int64)
+    num_later = 0
     for f in range(faces.shape[0]):
-        a, b, c = faces[f, 0], faces[f, 1], faces[f, 2]
-        ua, va, ub, vb, uc, vc = us[a], vs[a], us[b], vs[b], us[c], vs[c]
-        u0 = max(math.ceil(min(ua, ub, uc)), 0)
-        u1 = min(math.floor(max(ua, ub, uc)), width - 1)
-        v0 = max(math.ceil(min(va, vb, vc)), 0)
-        v1 = min(math.floor(max(va, vb, vc)), height - 1)
-        if u0 > u1 or v0 > v1:
-            continue
-        area = (ub - ua) * (vc - va) - (uc - ua) * (vb - va)
-        if area == 0.0:
-            continue
-        sign = 1.0 if area > 0 else -1.0
-        wa, wb, wc = inverse[a], inverse[b], inverse[c]
-        left, right, top, bottom = min(left, u0), max(right, u1), min(top, v0), max(bottom, v1)
-        for v in range(v0, v1 + 1):
-            for u in range(u0, u1 + 1):
-                ea = sign * ((ub - u) * (vc - v) - (uc - u) * (vb - v))
-                if ea < 0.0:
-                    continue
-                eb = sign * ((uc - u) * (va - v) - (ua - u) * (vc - v))
-                if eb < 0.0:
-                    continue
-                ec = sign * ((ua - u) * (vb - v) - (ub - u) * (va - v))
-                if ec < 0.0:
-                    continue
-                total = ea + eb + ec
-                if total == 0.0:  # a sliver thinner than rounding: its neighbours have this pixel
-                    continue
-                w = (ea * wa + eb * wb + ec * wc) / total
-                if w > buffer[v, u]:
-                    buffer[v, u] = w
-                    if face_ids is not None:
-                        face_ids[v, u] = f
+        a, b, c = corners[faces[f, 0]], corners[faces[f, 1]], corners[faces[f, 2]]
+        area = (b[0] - a[0]) * (c[1] - a[1]) - (c[0] - a[0]) * (b[1] - a[1])
+        if area > 0.0 and face_ids is None:
+            later[num_later] = f
+            num_later += 1
+        elif area != 0.0:
+            _draw_face(f, a, b, c, area, buffer, face_ids)
+    for i in range(num_later):
+        f = later[i]
+        _draw_face(f, corners[faces[f, 0]], corners[faces[f, 1]], corners[faces[f, 2]], 1.0, buffer, face_ids)
+
+    left = min(max(math.floor(corners[:, 0].min()), 0), width)
+    top = min(max(math.floor(corners[:, 1].min()), 0), height)
+    right = min(math.ceil(corners[:, 0].max()), width - 1)
+    bottom = min(math.ceil(corners[:, 1].max()), height - 1)
     for v in range(top, bottom + 1):
         for u in range(left, right + 1):
             if buffer[v, u] > 0.0:
                 depth[v, u] = 1.0 / buffer[v, u]
                 buffer[v, u] = 0.0
+
+
+@numba.njit(cache=True, nogil=True, inline="always")
+def _draw_face(
+    face: int,
+    a: np.ndarray,
+    b: np.ndarray,
+    c: np.ndarray,
+    area: float,
+    buffer: np.ndarray,
+    face_ids: np.ndarray | None,
+) -> None:
+    """Raise `buffer` to the inverse depth of a face with corners (u, v, inverse depth), wherever that is nearer.
+
+    Inverse depth is affine in the image, so it is interpolated with the edge functions and the largest wins.
+    Each edge function is computed from its two end points alone: neighbours get it with the opposite sign to
+    the last bit, so that no pixel falls through a shared edge.
+    """
+    height, width = buffer.shape
+    ua, va, wa = a[0], a[1], a[2]
+    ub, vb, wb = b[0], b[1], b[2]
+    uc, vc, wc = c[0], c[1], c[2]
+    u0 = max(math.ceil(min(ua, ub, uc)), 0)
+    u1 = min(math.floor(max(ua, ub, uc)), width - 1)
+    v0 = max(math.ceil(min(va, vb, vc)), 0)
+    v1 = min(math.floor(max(va, vb, vc)), height - 1)
+    sign = 1.0 if area > 0 else -1.0
+    nearest = max(wa, wb, wc) * (1.0 + 1e-12)  # at least what rounding can make of any weighted mean
+    for v in range(v0, v1 + 1):
+        for u in range(u0, u1 + 1):
+            if nearest <= buffer[v, u]:
+                continue
+            ea = sign * ((ub - u) * (vc - v) - (uc - u) * (vb - v))
+            if ea < 0.0:
+                continue
+            eb = sign * ((uc - u) * (va - v) - (ua - u) * (vc - v))
+            if eb < 0.0:
+                continue
+            ec = sign * ((ua - u) * (vb - v) - (ub - u) * (va - v))
+            if ec < 0.0:
+                continue
+            total = ea + eb + ec
+            if total == 0.0:  # a sliver thinner than rounding: its neighbours have this pixel
+                continue
+            w = (ea * wa + eb * wb + ec * wc) / total
+            if w > buffer[v, u]:
+                buffer[v, u] = w
+                if face_ids is not None:
+                    face_ids[v, u] = face
 
 
 @numba.njit(cache=True, nogil=True)
