@@ -1,9 +1,11 @@
 import itertools
 import os
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from hydra import compose, initialize_config_dir
 
 from datamodules.placement import draw_heading
 from datamodules.sources.embedded import EmbeddedSource
@@ -13,10 +15,23 @@ from ljn.geometry.camera import Camera
 from ljn.geometry.rotations import CAMERA_FROM_BODY, rotation_about, rotmat_to_rotvec, rotvec_to_rotmat
 from ljn.optional import import_open3d, import_pyrender
 from ljn.render import get_renderer
+from ljn.tasks.schema import register
 
 if "PYTEST_XDIST_WORKER" in os.environ:
     # With several threads in each worker, they would wait for one another's cores.
     torch.set_num_threads(1)
+
+
+@pytest.fixture(scope="session")
+def compose_config():
+    """Compose a configuration as run.py does, from overrides."""
+    register()
+
+    def make(*overrides, return_hydra_config=False):
+        with initialize_config_dir(str(Path(__file__).parents[1] / "conf"), version_base="1.3"):
+            return compose("config", list(overrides), return_hydra_config=return_hydra_config)
+
+    return make
 
 
 @pytest.fixture(scope="session")

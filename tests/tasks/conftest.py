@@ -5,10 +5,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
-
-from ljn.tasks.schema import register
 
 ROOT = Path(__file__).parents[2]
 SMOKE = ("preset=smoke", "logger=csv", "data.num_workers=0")
@@ -20,18 +17,6 @@ def keep_num_threads():
     before = torch.get_num_threads()
     yield
     torch.set_num_threads(before)
-
-
-@pytest.fixture(scope="session")
-def compose_config():
-    """Compose a configuration as run.py does, from overrides."""
-    register()
-
-    def make(*overrides, return_hydra_config=False):
-        with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
-            return compose("config", list(overrides), return_hydra_config=return_hydra_config)
-
-    return make
 
 
 @pytest.fixture(scope="session")

@@ -1,0 +1,31 @@
+import pytest
+import torch
+from torch.optim.lr_scheduler import OneCycleLR
+
+from ljn.building import build
+
+EXPERIMENTS = ("proposed", "single", "pointnet", "basic")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("experiment", EXPERIMENTS)
+def test_eight_samples_are_overfitted(experiment, compose_config, tmp_path):
+    cfg = compose_config(
+        *(f"experiment=mesh/{experiment}", "preset=small", f"paths.output_dir={tmp_path}"),
+        *("data.num_train=8", "data.num_points=256", "data.num_workers=0"),
+    )
+    torch.manual_seed(0)
+    module = build(cfg.module)
+    batch, _ = build(cfg.data).examples("train", range(8))
+    steps = 800
+    optimizer = torch.optim.Adam(module.net.parameters())
+    schedule = OneCycleLR(optimizer, 2e-3, steps)
+    for _ in range(steps):
+        optimizer.zero_grad()
+        module.loss(batch).backward()
+        optimizer.step()
+        schedule.step()
+    module.eval()
+    with torch.no_grad():
+        apve_mm = module.evaluate(batch, module.test_metrics)["apve"]
+    assert float(apve_mm.mean()) < 10
