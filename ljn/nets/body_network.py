@@ -64,7 +64,6 @@ class BodyNetwork(nn.Module, ABC):
         identity = [0.0, 0, 0] if rotation == "rotvec" else [1.0, 0, 0, 0, 1, 0]
         self.mean_pose = nn.Parameter(torch.tensor(identity).repeat(NUM_JOINTS, 1))
         self.mean_betas = nn.Parameter(torch.zeros(NUM_BETAS))
-        start_small(self.head[-1])
 
     def forward(self, points: Tensor, initial_joints: Tensor) -> BodyEstimate:
         """Estimate pose and shape.
@@ -135,7 +134,6 @@ class HierarchicalBodyNetwork(BodyNetwork):
             [size + NUM_JOINTS * self.num_angles + NUM_BETAS, *regressor_channels, NUM_BETAS],
             last_activation=False,
         )
-        start_small(self.beta_regressor[-1])
 
     def refine(self, feature: Tensor, pose: Tensor, betas: Tensor) -> list[tuple[Tensor, Tensor]]:
         """See `BodyNetwork.refine`."""
@@ -181,7 +179,6 @@ class JointRegressors(nn.Module):
         self.first = StackedLinear(self.num_joints, num_own + feature_channels, channels[0])
         self.first_activation = StackedPReLU(self.num_joints)
         self.rest = stacked_perceptron(self.num_joints, [*channels, num_angles], last_activation=False)
-        start_small(self.rest[-1])
 
     def share(self, feature: Tensor) -> Tensor:
         """The first layer's part that all iterations share: `(B, C)` -> `(k, B, channels[0])`."""
@@ -229,7 +226,6 @@ class DirectBodyNetwork(BodyNetwork):
         self.regressor = perceptron(
             [self.trunk.out_channels + num_values, *regressor_channels, num_values], last_activation=False
         )
-        start_small(self.regressor[-1])
 
     def refine(self, feature: Tensor, pose: Tensor, betas: Tensor) -> list[tuple[Tensor, Tensor]]:
         """See `BodyNetwork.refine`."""
@@ -240,14 +236,6 @@ class DirectBodyNetwork(BodyNetwork):
             betas = betas + residual[:, -NUM_BETAS:]
             estimates.append((pose, betas))
         return estimates
-
-
-def start_small(layer: nn.Module) -> None:
-    """Shrink a last layer's weights: residuals begin near zero, as in HMR (Kanazawa et al. 2018)."""
-    assert isinstance(layer, nn.Linear | StackedLinear)
-    with torch.no_grad():
-        layer.weight.mul_(0.01)
-        layer.bias.zero_()
 
 
 def _ancestors(joint: int) -> list[int]:
