@@ -1,6 +1,7 @@
 """`task=evaluate`: test a checkpoint, with nothing but the checkpoint."""
 
 import logging
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -59,9 +60,25 @@ def evaluate(cfg: DictConfig) -> dict[str, float]:
     """
     if cfg.ckpt_path is None:
         raise ValueError("ckpt_path: expected the checkpoint to evaluate, got null; add ckpt_path=FILE")
-    checkpoint = read_checkpoint(cfg.ckpt_path)
     overrides = list(HydraConfig.get().overrides.task) if HydraConfig.initialized() else []
+    return evaluate_checkpoint(cfg, cfg.ckpt_path, overrides)
+
+
+def evaluate_checkpoint(
+    cfg: DictConfig, path: str | Path, overrides: list[str], name: str | None = None, reuses: bool = False
+) -> dict[str, float]:
+    """Test a checkpoint; see `evaluate`.
+
+    Args:
+        cfg: The call's composed configuration; `paths.run_dir` is set here.
+        path: The checkpoint.
+        overrides: Changes of single values, as they would be typed.
+        name: Name of the evaluation's directory and record; None for that of the checkpoint.
+        reuses: Whether an equal evaluation, if there is a complete one, is taken instead.
+    """
+    checkpoint = read_checkpoint(path)
     call, cfg = cfg, with_checkpoint_config(cfg, checkpoint, overrides)
+    cfg.name = name or cfg.name
     validate(cfg)
 
     datamodule: BodyDataModule = build(cfg.data)
@@ -70,6 +87,9 @@ def evaluate(cfg: DictConfig) -> dict[str, float]:
     identity_hash = records.config_hash(identity)
     run_dir = set_run_directory(cfg, "evaluations", identity_hash)
     call.paths.run_dir = str(run_dir)
+    if reuses and not call.rerun and records.is_complete(run_dir, identity_hash):
+        _LOG.info("%s is complete; evaluate it again with rerun=true", run_dir)
+        return records.read_json(run_dir / "metrics.json") or {}
 
     prepare_process(cfg)
     module = build(cfg.module)

@@ -17,6 +17,7 @@ class Config:
     num_threads: int | None = None
     ckpt_path: str | None = None
     rerun: bool = False
+    tables: list[str] = field(default_factory=list)
     optimized_metric: str = "val/mpjpe"
     input: str | None = None
     camera: str | None = None

@@ -1,0 +1,91 @@
+"""A sweep's results side by side: tables and a page, on disk, on the terminal and in the tracker."""
+
+import os
+import shlex
+import sys
+from pathlib import Path
+from typing import Any
+
+from hydra.core.utils import JobReturn, JobStatus
+from hydra.experimental.callback import Callback
+from hydra.types import RunMode
+from omegaconf import DictConfig
+
+from ljn.report import write_report
+from ljn.tasks.records import read_json, write_json
+
+
+class SweepReport(Callback):
+    """Hydra callback: gathers a multirun's runs in `output_dir/sweeps/NAME-PRESET` and writes their tables.
+
+    After every job, so that neither a failure nor a kill costs what is there: `sweep.json`, which names the runs, and
+    the tables as files. At the end also `report.html`, and the tables are printed. Each job leaves a note in Hydra's
+    sweep directory, since jobs may run in processes of their own.
+
+    Args:
+        output_dir: `paths.output_dir`.
+    """
+
+    def __init__(self, output_dir: str | Path) -> None:
+        self.output_dir = Path(output_dir)
+
+    def on_job_end(self, config: DictConfig, job_return: JobReturn, **kwargs: Any) -> None:
+        """Note what became of a job; write the tables of all so far."""
+        if config.hydra.mode != RunMode.MULTIRUN:
+            return
+        assert job_return.cfg is not None
+        is_complete = job_return.status == JobStatus.COMPLETED
+        # Of a failed job, reading `return_value` would raise it.
+        error = None if is_complete else job_return._return_value
+        typed = list(config.hydra.overrides.task)
+        note = {
+            "experiment": config.hydra.runtime.choices.get("experiment"),
+            "overrides": typed,
+            "seed": job_return.cfg.seed,
+            "run_dir": self._relative(job_return.cfg.paths.run_dir),
+            "status": "complete" if is_complete else "failed",
+            "error": None if is_complete else f"{type(error).__name__}: {error}",
+        }
+        notes = self._notes(config)
+        notes.mkdir(parents=True, exist_ok=True)
+        write_json(notes / f"{int(config.hydra.job.num):04d}.json", note)
+        write_report(self._gather(config), is_final=False)
+
+    def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
+        """Write and print the tables of all jobs, and the page."""
+        if not self._notes(config).is_dir():  # not one job came to its end
+            return
+        directory = self._gather(config)
+        report = write_report(directory)
+        jobs = (read_json(directory / "sweep.json") or {})["jobs"]
+        runs = {str(job["run_dir"]) for job in jobs if job["run_dir"]}
+        num_trained = sum(run.startswith("runs") for run in runs)
+        print(f"\n{report.text}\n\n{len(jobs)} jobs: {num_trained} trainings, {len(runs) - num_trained} evaluations")
+        print("\n".join(map(str, report.paths)), flush=True)
+
+    def _notes(self, config: DictConfig) -> Path:
+        return Path(config.hydra.sweep.dir) / "jobs"
+
+    def _gather(self, config: DictConfig) -> Path:
+        """Write `sweep.json` from the jobs' notes; returns its directory."""
+        chosen = config.hydra.runtime.choices.get("sweep")
+        preset = config.preset.name
+        # A grid of the user's own has no name but the time of its start.
+        name = chosen or f"grid-{Path(config.hydra.sweep.dir).name}"
+        directory = self.output_dir / "sweeps" / (name if name == preset else f"{name}-{preset}")
+        directory.mkdir(parents=True, exist_ok=True)
+        content = {
+            "name": name,
+            "preset": preset,
+            "tables": list(config.tables),
+            "command": shlex.join(["python", "run.py", *sys.argv[1:]]),
+            "jobs": [
+                note for path in sorted(self._notes(config).glob("*.json")) if (note := read_json(path))
+            ],
+        }
+        write_json(directory / "sweep.json", content)
+        return directory
+
+    def _relative(self, run_dir: str | None) -> str | None:
+        """A run's directory as seen from `output_dir`, so that the whole output can be moved."""
+        return None if run_dir is None else os.path.relpath(run_dir, self.output_dir)

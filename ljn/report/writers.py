@@ -1,0 +1,324 @@
+"""A sweep's tables as plain text, CSV, Markdown and LaTeX."""
+
+import csv
+import io
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from ljn.report.ordering import Comparison, verdict
+from ljn.report.results import Cell, Results, RowResult, TableResult
+from ljn.report.runs import Run
+from ljn.report.tables import Column
+
+NONE = "–"
+
+CSV_FIELDS = (
+    "table", "row", "experiment", "overrides", "x", "column", "metric", "unit", "mean", "sd", "num_seeds", "thesis",
+    "difference", "status", "run_dirs",
+)  # fmt: skip
+
+
+def number(value: float | None, is_signed: bool = False) -> str:
+    """A number with one decimal; a dash for none."""
+    if value is None:
+        return NONE
+    value = round(value, 1) + 0.0  # no negative zero
+    return f"{value:+.1f}" if is_signed else f"{value:.1f}"
+
+
+def ours(row: RowResult, cell: Cell) -> str:
+    """Our value with its standard deviation over seeds; `failed` or `missing` where there is none, never nothing."""
+    if cell.metric is None:
+        return NONE
+    if cell.mean is None:
+        return "FAILED" if row.is_failed else "missing"
+    value = number(cell.mean) if cell.sd is None else f"{number(cell.mean)} ± {number(cell.sd)}"
+    return f"{value} †" if cell.is_substituted else value
+
+
+def headings(column: Column, has_thesis: bool) -> list[str]:
+    """What is shown below a column: a difference only of results."""
+    return ["thesis", "ours", *["difference"] * bool(column.goal)] if has_thesis else ["ours"]
+
+
+def seeds(row: RowResult) -> str:
+    """How many seeds its numbers come from; and its status, where that is not `complete`."""
+    count = max((cell.num_seeds for cell in row.cells), default=0)
+    return str(count) if row.status == "complete" else f"{count} ({row.status})"
+
+
+def lead_unit(comparison: Comparison) -> str:
+    """The unit of a difference."""
+    return "points" if comparison.column.unit == "%" else comparison.column.unit
+
+
+def describe_comparison(comparison: Comparison) -> str:
+    """A comparison in words."""
+    text = f"{comparison.column.label}: {comparison.better} better than {comparison.worse}"
+    if comparison.is_adjacent:
+        text += ", next to it in the thesis,"
+    if comparison.is_claim:
+        text += " holds" if comparison.holds else " does not hold"
+    text += f", by {number(comparison.lead, is_signed=True)} {lead_unit(comparison)}"
+    if comparison.exceeds_spread is not None:
+        text += f", {'more' if comparison.exceeds_spread else 'not more'} than the spread over seeds"
+        text += f" ({number(comparison.spread)})"
+    if comparison.interval is not None:
+        low, high = (number(end, is_signed=True) for end in comparison.interval)
+        text += f", 95 % interval over test samples {low} to {high}"
+    return text
+
+
+def describe_order(table: TableResult) -> str:
+    """The verdict on the thesis's ordering, column by column; of tables without thesis's numbers, nothing."""
+    if not any(table.has_thesis):
+        return ""
+    if not table.comparisons:
+        return f"The thesis's ordering: {verdict([])[1]}."
+    parts = []
+    for column in table.table.columns:
+        if column.goal is not None:
+            own = [comparison for comparison in table.comparisons if comparison.column is column]
+            parts.append(f"{column.label} {verdict(own)[1]}")
+    return "The thesis's ordering: " + "; ".join(parts) + "."
+
+
+def describe_job(run: Run) -> str:
+    """A run that failed or is missing, and why."""
+    reason = run.error or ("no error was recorded" if run.status == "failed" else "it left no test metrics")
+    return f"{run.status.upper()} {run.name}: {reason}"
+
+
+def notes(results: Results, table: TableResult) -> list[str]:
+    """A table's footnotes."""
+    found = list(table.table.notes)
+    sources = sorted(
+        {str(run.data["source"]) for row in table.rows for run in row.runs if run.data.get("source")}
+    )
+    if any(table.has_thesis) and (results.sweep.preset != "thesis" or sources != ["surreal"]):
+        found.append(
+            f"Ours: preset {results.sweep.preset}, data source {' and '.join(sources) or 'missing'}. The thesis: "
+            "60,000 training samples of SURREAL. Compare the order of the rows rather than their values."
+        )
+    return found
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """A table's cells as text: what the plain, Markdown and LaTeX tables have in common.
+
+    Attributes:
+        groups: A heading and how many columns it spans, for each of the table's columns.
+        columns: Second headings, one a column.
+        rows: Texts, the row's label first.
+        num_own: How many of the rows are ours; literature follows.
+    """
+
+    groups: list[tuple[str, int]]
+    columns: list[str]
+    rows: list[list[str]]
+    num_own: int
+
+
+def sheet(table: TableResult) -> Sheet:
+    """A table as text."""
+    groups: list[tuple[str, int]] = [("", 1)]
+    columns = [""]
+    for column, has_thesis in zip(table.table.columns, table.has_thesis):
+        names = headings(column, has_thesis)
+        groups.append((column.heading, len(names)))
+        columns += names
+    groups.append(("", 1))
+    columns.append("seeds")
+    rows = []
+    for row in table.rows:
+        texts = [row.label]
+        for cell, has_thesis in zip(row.cells, table.has_thesis):
+            value = ours(row, cell)
+            entries = {
+                "thesis": number(cell.thesis),
+                "ours": value,
+                "difference": number(cell.difference, True),
+            }
+            texts += [entries[name] for name in headings(cell.column, has_thesis)]
+        rows.append([*texts, seeds(row) if any(cell.metric for cell in row.cells) else NONE])
+    for entry in table.table.literature:
+        texts = [f"{entry.label} ({entry.source})"]
+        for column, has_thesis in zip(table.table.columns, table.has_thesis):
+            value = number(entry.values.get(column.metric))
+            texts += [value if name == "thesis" else NONE for name in headings(column, has_thesis)]
+        rows.append([*texts, NONE])
+    return Sheet(groups, columns, rows, len(table.rows))
+
+
+def to_text(results: Results) -> str:
+    """Plain tables for the terminal, the failed runs by name below them."""
+    parts = [_text_table(results, table) for table in results.tables]
+    parts.append("\n".join(describe_job(run) for run in (*results.failed, *results.missing)))
+    return "\n\n".join(part for part in parts if part) + "\n"
+
+
+def _text_table(results: Results, table: TableResult) -> str:
+    page = sheet(table)
+    widths = [
+        max(len(line[index]) for line in [page.columns, *page.rows]) for index in range(len(page.columns))
+    ]
+    start = 0
+    heading = []
+    for name, span in page.groups:
+        own = slice(start, start + span)
+        # A heading wider than its columns widens the last of them.
+        missing = len(name) - (sum(widths[own]) + 2 * (span - 1))
+        widths[start + span - 1] += max(missing, 0)
+        heading.append(name.rjust(sum(widths[own]) + 2 * (span - 1)))
+        start += span
+
+    def line(texts: Sequence[str]) -> str:
+        cells = [
+            text.ljust(width) if not index else text.rjust(width)
+            for index, (text, width) in enumerate(zip(texts, widths))
+        ]
+        return "  ".join(cells).rstrip()
+
+    body = [line(row) for row in page.rows]
+    return "\n".join(
+        [
+            f"{table.table.title} (preset {results.sweep.preset})",
+            "  ".join(heading).rstrip(),
+            line(page.columns),
+            *body,
+        ]
+        + [text for text in (describe_order(table),) if text]
+    )
+
+
+def to_csv(results: Results) -> str:
+    """Every number of every table, one a line: unrounded, empty where there is none."""
+    buffer = io.StringIO()
+    writer = csv.DictWriter(buffer, CSV_FIELDS, lineterminator="\n")
+    writer.writeheader()
+    for table in results.tables:
+        for row in table.rows:
+            for cell in row.cells:
+                writer.writerow(
+                    {
+                        "table": table.table.name,
+                        "row": row.label,
+                        "experiment": row.row.experiment,
+                        "overrides": " ".join(row.runs[0].overrides) if row.runs else None,
+                        "x": row.x,
+                        "column": cell.column.label,
+                        "metric": cell.metric,
+                        "unit": cell.column.unit,
+                        "mean": cell.mean,
+                        "sd": cell.sd,
+                        "num_seeds": cell.num_seeds,
+                        "thesis": cell.thesis,
+                        "difference": cell.difference,
+                        "status": row.status,
+                        "run_dirs": ";".join(str(run.directory) for run in row.runs if run.directory),
+                    }
+                )
+    return buffer.getvalue()
+
+
+def to_markdown(results: Results) -> str:
+    """The tables in Markdown, with footnotes, orderings and failed runs."""
+    parts = [f"# {_markdown(results.sweep.name)}"]
+    for table in results.tables:
+        page = sheet(table)
+        names = [
+            f"{group}: {column}" if group else column
+            for (group, column) in zip(
+                [name for name, span in page.groups for _ in range(span)], page.columns
+            )
+        ]
+        lines = [names, ["---"] + ["---:"] * (len(names) - 1), *page.rows]
+        is_rule = [False, True] + [False] * len(page.rows)
+        parts += [
+            f"## {_markdown(table.table.title)}",
+            "\n".join(
+                "| " + " | ".join(texts if rule else map(_markdown, texts)) + " |"
+                for texts, rule in zip(lines, is_rule)
+            ),
+            _markdown(describe_order(table)),
+            "\n".join(f"- {_markdown(describe_comparison(entry))}" for entry in table.comparisons),
+            "\n".join(_markdown(note) + "  " for note in notes(results, table)).rstrip(),
+        ]
+    parts.append(
+        "\n".join(f"- {_markdown(describe_job(run))}" for run in (*results.failed, *results.missing))
+    )
+    return "\n\n".join(part for part in parts if part) + "\n"
+
+
+def to_latex(results: Results) -> str:
+    """The tables in LaTeX, a `table` environment each; they need the package booktabs."""
+    return "\n".join(_latex_table(results, table) for table in results.tables)
+
+
+def _latex_table(results: Results, table: TableResult) -> str:
+    page = sheet(table)
+    headings, rules, start = [], [], 1
+    for name, span in page.groups:
+        headings.append(f"\\multicolumn{{{span}}}{{c}}{{{latex(name)}}}" if name else "")
+        if name:
+            rules.append(f"\\cmidrule(lr){{{start}-{start + span - 1}}}")
+        start += span
+
+    def line(texts: Sequence[str], escape: Callable[[str], str] = latex) -> str:
+        return "    " + " & ".join(map(escape, texts)) + r" \\"
+
+    body = [line(row) for row in page.rows]
+    if page.num_own < len(body):
+        body.insert(page.num_own, r"    \midrule")
+    failed = [describe_job(run) for row in table.rows for run in row.runs if run.status != "complete"]
+    remarks = [text for text in (describe_order(table), *notes(results, table), *failed) if text]
+    return "\n".join(
+        [
+            "% needs \\usepackage{booktabs}",
+            r"\begin{table}",
+            r"  \centering",
+            f"  \\caption{{{latex(table.table.title)} (preset {latex(results.sweep.preset)}).}}",
+            f"  \\label{{tab:{re.sub(r'[^A-Za-z0-9]+', '-', table.table.name)}}}",
+            f"  \\begin{{tabular}}{{l{'r' * (len(page.columns) - 1)}}}",
+            r"    \toprule",
+            line(headings, str),
+            "    " + "".join(rules),
+            line(page.columns),
+            r"    \midrule",
+            *body,
+            r"    \bottomrule",
+            r"  \end{tabular}",
+            *(f"  \\par\\smallskip\\footnotesize {latex(remark)}" for remark in remarks),
+            r"\end{table}",
+            "",
+        ]
+    )
+
+
+_LATEX = {
+    "\\": r"\textbackslash{}",
+    "~": r"\textasciitilde{}",
+    "^": r"\textasciicircum{}",
+    "<": r"\textless{}",
+    ">": r"\textgreater{}",
+    "|": r"\textbar{}",
+    '"': r"\textquotedbl{}",
+    "σ": r"$\sigma$",
+    "±": r"$\pm$",
+    "–": "--",
+    "†": r"$\dagger$",
+    "\n": " ",
+    **{character: f"\\{character}" for character in "&%$#_{}"},
+}
+
+
+def latex(text: str) -> str:
+    """Text with what LaTeX would take for commands escaped; a number's sign becomes a minus."""
+    escaped = "".join(_LATEX.get(character, character) for character in text)
+    return re.sub(r"^-(?=\d)", "$-$", escaped)
+
+
+def _markdown(text: str) -> str:
+    return re.sub(r"([\\|*_`<>\[\]])", r"\\\1", text.replace("\n", " "))

@@ -1,0 +1,53 @@
+"""`task=cross`: a trained model on data that it was not trained for; rows of the thesis's tables."""
+
+from pathlib import Path
+
+from hydra import compose
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig, open_dict
+
+from ljn.tasks.evaluate import evaluate_checkpoint
+from ljn.tasks.train import train
+
+
+def cross(cfg: DictConfig) -> dict[str, float]:
+    """Train a configuration, or find it trained, then test its best checkpoint on changed data.
+
+    Args:
+        cfg: The composed configuration. `task.trains` names the experiment whose run is meant, so that rows share
+            it; `task.overrides` change single values of the data, as with `task=evaluate`; `task.detector` is the
+            experiment of a joint detector, trained or found in the same way, that gives the initial joints.
+
+    Returns:
+        The test metrics, also in `metrics.json` of the evaluation's directory, which is left in `paths.run_dir`.
+
+    Raises:
+        ValueError: See `train` and `evaluate`; or `task.trains` is not set.
+    """
+    task = cfg.task
+    if task.trains is None:
+        raise ValueError(
+            "task.trains: expected the experiment whose run is tested, got null; choose a row, as in "
+            "experiment=mesh/chain"
+        )
+    overrides = list(task.overrides)
+    if task.detector is not None:
+        detector = _trained(_composed(cfg, task.detector), task.detector)
+        overrides += ["data.initial_joints=detector", f"data.detector_ckpt='{detector}'"]
+    return evaluate_checkpoint(cfg, _trained(cfg.copy(), task.trains), overrides, cfg.name, reuses=True)
+
+
+def _trained(cfg: DictConfig, name: str) -> Path:
+    """The best checkpoint of a configuration, trained here if need be."""
+    with open_dict(cfg):
+        cfg.name = name
+        cfg.rerun = False  # that of the evaluation is meant
+    train(cfg)
+    return Path(cfg.paths.run_dir) / "checkpoints" / "best.ckpt"
+
+
+def _composed(cfg: DictConfig, experiment: str) -> DictConfig:
+    """This call's configuration with another experiment in place of its own."""
+    typed = HydraConfig.get().overrides.task
+    kept = [line for line in typed if not line.lstrip("+~").startswith(("experiment=", "task"))]
+    return compose("config", [f"experiment={experiment}", *kept])

@@ -1,0 +1,99 @@
+import json
+
+import numpy as np
+import pytest
+from PIL import Image
+
+
+class FakeSweep:
+    """A sweep's directory, and runs in it as training leaves them."""
+
+    def __init__(self, directory):
+        self.directory = directory
+        self.jobs = []
+
+    def run(self, experiment, metrics, seed=0, overrides=(), errors=None, **changes):
+        """A finished run: test metrics without `test/`; `errors` `(S,)` mm, the same for each joint."""
+        folder = self.directory / "runs" / f"run-{len(self.jobs)}"
+        (folder / "csv" / "version_0").mkdir(parents=True)
+        (folder / "pictures").mkdir()
+        content = {f"test/{name}": value for name, value in metrics.items()}
+        (folder / "metrics.json").write_text(json.dumps(content))
+        (folder / "record.json").write_text(json.dumps(RECORD | changes))
+        (folder / "config.yaml").write_text("data:\n  num_points: 512\n")
+        main = "apve" if "apve" in metrics else "mpjpe_eq38"
+        lines = [f"epoch,step,train/loss,val/{main},val/mpjpe"]
+        for epoch in range(3):
+            lines += [f"{epoch},{epoch},,{90 - epoch},{95 - epoch}", f"{epoch},{epoch},0.5,,"]
+        lines.append("3,3,,88,93")  # the best checkpoint's validation after the training
+        (folder / "csv" / "version_0" / "metrics.csv").write_text("\n".join(lines) + "\n")
+        picture = Image.new("RGB", (2000, 100), (200, 60, 60))
+        picture.save(folder / "pictures" / "test_best_median_worst.png")
+        if errors is not None:
+            # Eq. 3.8 leaves the root out.
+            joint_errors = np.repeat(np.asarray(errors)[:, None], 24, 1) * 24 / 23
+            np.savez(folder / "test_errors.npz", sample_id=np.arange(len(errors)), errors_mm=joint_errors)
+        self.job(experiment, seed, overrides, run_dir=str(folder))
+        return folder
+
+    def job(self, experiment, seed=0, overrides=(), run_dir=None, status="complete", error=None):
+        typed = [*([f"experiment={experiment}"] if experiment else []), f"seed={seed}", *overrides]
+        self.jobs.append(
+            {"experiment": experiment, "overrides": typed, "seed": seed}
+            | {"run_dir": run_dir, "status": status, "error": error}
+        )
+
+    def write(self, *tables, **changes):
+        content = {"name": "sweep", "preset": "small", "tables": list(tables), "command": "python run.py"}
+        (self.directory / "sweep.json").write_text(json.dumps(content | {"jobs": self.jobs} | changes))
+        return self.directory
+
+
+RECORD = {
+    "status": "complete",
+    "preset": "small",
+    "config_hash": "c0ffee12",
+    "commit": "0123456789abcdef",
+    "is_dirty": True,
+    "versions": {"python": "3.11.7", "torch": "2.7.0"},
+    "device": "cpu",
+    "started": "2026-01-02T03:04:05+00:00",
+    "wall_time_s": 3725.0,
+    "num_parameters": 1006757,
+    "data": {
+        "source": "embedded",
+        "version": 1,
+        "fingerprint": "feed5eed",
+        "licence": "CC0",
+        "sizes": {"train": 12000, "val": 500, "test": 2000},
+        "pool": {"train": "aaaa1111", "val": "bbbb2222", "test": "cccc3333"},
+        "bodies": {"female": "dddd4444", "male": "eeee5555"},
+        "detector": None,
+        "seeds": {"seed": 0},
+    },
+}
+
+
+@pytest.fixture
+def sweep(tmp_path):
+    return FakeSweep(tmp_path)
+
+
+@pytest.fixture
+def table_3_2(sweep):
+    """Table 3.2 with two seeds of each row, ordered as in the thesis, and a row that failed."""
+    for seed, more in enumerate((0.0, 1.0)):
+        sweep.run("detector/basic", {"mpjpe_eq38": 90 + more, "pckh": 40 - more}, seed)
+        sweep.run("detector/no_edm", {"mpjpe_eq38": 70 + more, "pckh": 52 - more}, seed)
+        sweep.run("detector/proposed", {"mpjpe_eq38": 60 + more, "pckh": 55 - more}, seed)
+        aligned = {
+            "mpjpe_eq38": 999.0,
+            "mpjpe_root_aligned": 100 + more,
+            "pckh": 1.0,
+            "pckh_root_aligned": 30 - more,
+        }
+        sweep.run("detector/simple_baseline_0px", aligned, seed)
+    sweep.job(
+        "detector/simple_baseline", status="failed", error="ValueError: <script>alert(1)</script> & more_text"
+    )
+    return sweep.write("table_3_2")

@@ -1,0 +1,122 @@
+import numpy as np
+import pytest
+
+from ljn.report.ordering import paired_bootstrap, verdict
+from ljn.report.results import read_results
+
+
+def comparisons(directory):
+    return read_results(directory).tables[0].comparisons
+
+
+def test_all_pairs_that_the_thesis_orders_and_that_have_results_are_compared(table_3_2):
+    found = comparisons(table_3_2)
+    assert verdict(found) == (True, "holds in all 12 comparisons")
+    own = [
+        (entry.better, entry.worse) for entry in found if entry.column.label == "MPJPE" and entry.is_adjacent
+    ]
+    assert own == [
+        ("proposed", "proposed without EDM"),
+        ("proposed without EDM", "basic"),
+        ("basic", "simple baseline, σ = 0"),
+    ]
+
+
+def test_a_wrong_order_does_not_hold(sweep):
+    sweep.run("detector/basic", {"mpjpe_eq38": 60.0, "pckh": 40.0})
+    sweep.run("detector/proposed", {"mpjpe_eq38": 70.0, "pckh": 50.0})
+    found = comparisons(sweep.write("table_3_2"))
+    assert [(entry.column.label, entry.holds, entry.lead) for entry in found] == [
+        ("MPJPE", False, -10.0),
+        ("PCKh", True, 10.0),
+    ]
+    assert verdict(found) == (False, "does not hold in 1 of 2 comparisons")
+
+
+def test_a_draw_does_not_hold(sweep):
+    for name in ("basic", "proposed"):
+        sweep.run(f"detector/{name}", {"mpjpe_eq38": 60.0})
+    assert not comparisons(sweep.write("table_3_2"))[0].holds
+
+
+def test_one_row_alone_is_not_judged(sweep):
+    sweep.run("detector/basic", {"mpjpe_eq38": 60.0})
+    assert verdict(comparisons(sweep.write("table_3_2")))[0] is None
+
+
+def test_what_describes_the_input_is_not_compared(sweep):
+    for name in ("sigma_0px", "sigma_5px"):
+        sweep.run(f"detector/{name}", {"mpjpe_eq38": 60.0, "initial_max_distance_px": 3.0})
+    assert {entry.column.label for entry in comparisons(sweep.write("table_3_3"))} == {"MPJPE"}
+
+
+@pytest.mark.parametrize(("apart", "exceeds"), [(10.0, True), (1.0, False)])
+def test_a_lead_is_held_against_its_spread_over_seeds(sweep, apart, exceeds):
+    for seed, more in enumerate((-2.0, 2.0)):
+        sweep.run("detector/basic", {"mpjpe_eq38": 60 + apart + more}, seed)
+        sweep.run("detector/proposed", {"mpjpe_eq38": 60 + more}, seed)
+    (entry,) = comparisons(sweep.write("table_3_2"))
+    assert entry.lead == pytest.approx(apart)
+    assert entry.spread == pytest.approx(4.0)  # the root of two variances of 8
+    assert entry.exceeds_spread is exceeds
+
+
+def test_without_the_thesis_s_numbers_the_best_row_is_compared_with_the_others(sweep):
+    for name, value in (("mean_offset", 130.0), ("proposed", 60.0), ("ridge", 90.0)):
+        sweep.run(f"detector/{name}", {"mpjpe": value, "initial_mpjpe": 160.0})
+    found = comparisons(sweep.write("demo"))
+    assert {entry.better for entry in found} == {"proposed"}
+    assert not any(entry.is_claim for entry in found)
+    assert verdict(found)[0] is None
+
+
+def test_the_bootstrap_s_interval_covers_a_known_difference_and_is_paired():
+    generator = np.random.default_rng(3)
+    shared = generator.normal(60, 30, 4000)  # a sample is hard for both
+    low, high = paired_bootstrap(shared, shared + generator.normal(2, 1, 4000))
+    assert low < 2 < high
+    assert high - low == pytest.approx(2 * 1.96 / np.sqrt(4000), rel=0.15)
+
+
+def test_the_bootstrap_repeats_itself():
+    errors = np.random.default_rng(0).normal(size=(2, 50))
+    assert paired_bootstrap(*errors) == paired_bootstrap(*errors)
+
+
+def test_runs_with_the_errors_of_the_same_samples_get_an_interval(sweep):
+    errors = np.random.default_rng(1).uniform(20, 90, 300)
+    for seed in (0, 1):
+        sweep.run("detector/basic", {"mpjpe_eq38": errors.mean() + 5}, seed, errors=errors + 5)
+        sweep.run("detector/proposed", {"mpjpe_eq38": errors.mean()}, seed, errors=errors)
+    (entry,) = comparisons(sweep.write("table_3_2"))
+    assert entry.interval == pytest.approx((5, 5))
+
+
+@pytest.mark.parametrize("damage", ["fewer samples", "no file", "no zip file", "another metric"])
+def test_without_the_errors_of_the_same_samples_there_is_no_interval(sweep, damage):
+    errors = np.random.default_rng(1).uniform(20, 90, 30)
+    sweep.run("detector/basic", {"mpjpe_eq38": 60.0}, errors=errors)
+    folder = sweep.run(
+        "detector/proposed", {"mpjpe_eq38": 50.0}, errors=errors[:20] if "fewer" in damage else errors
+    )
+    path = folder / "test_errors.npz"
+    if damage == "no file":
+        path.unlink()
+    elif damage == "no zip file":
+        path.write_bytes(b"PK\x03\x04 cut off")
+    elif damage == "another metric":
+        np.savez(path, sample_id=np.arange(30), apve_mm=errors)
+    (entry,) = comparisons(sweep.write("table_3_2"))
+    assert entry.interval is None
+
+
+def test_root_aligned_errors_are_made_of_the_joints(sweep):
+    sweep.run("detector/simple_baseline_0px", {"mpjpe_root_aligned": 90.0})
+    folder = sweep.directory / "runs" / "run-0"
+    joints = np.random.default_rng(2).normal(size=(5, 24, 3))
+    moved = joints + np.array([0.3, 0, 2.0])
+    moved[:, 5] += [0, 0, 0.024]
+    np.savez(folder / "test_errors.npz", sample_id=np.arange(5), joints=joints, pred_joints=moved)
+    run = read_results(sweep.write("table_3_2")).sweep.runs[0]
+    _, errors = run.sample_errors("mpjpe_root_aligned")
+    assert errors == pytest.approx(np.ones(5))

@@ -1,0 +1,236 @@
+import base64
+import io
+import json
+import re
+import shutil
+import subprocess
+from html.parser import HTMLParser
+
+import pytest
+from PIL import Image
+
+from ljn.report import write_report
+
+VOID = {"meta", "link", "img", "br"}
+
+
+class Page(HTMLParser):
+    """Elements with their attributes; fails where a tag is not closed in order."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.elements = []
+        self._open = []
+        self.feed(text)
+        assert not self._open
+
+    def handle_starttag(self, tag, attributes):
+        self.elements.append((tag, dict(attributes)))
+        if tag not in VOID:
+            self._open.append(tag)
+
+    def handle_startendtag(self, tag, attributes):
+        self.elements.append((tag, dict(attributes)))
+
+    def handle_endtag(self, tag):
+        assert self._open.pop() == tag
+
+    def all(self, name):
+        return [attributes for tag, attributes in self.elements if tag == name]
+
+
+@pytest.fixture
+def html(table_3_2):
+    write_report(table_3_2)
+    return (table_3_2 / "report.html").read_text()
+
+
+def test_the_page_asks_for_nothing_from_elsewhere(html):
+    page = Page(html)
+    assert not re.search(r"https?://|url\(|@import|@font-face", html)
+    assert not page.all("script")
+    for _, attributes in page.elements:
+        for name in ("src", "href", "srcset", "xlink:href", "action"):
+            assert attributes.get(name, "data:").startswith(("data:", "#"))
+    policy = next(
+        meta["content"] for meta in page.all("meta") if meta.get("http-equiv") == "Content-Security-Policy"
+    )
+    assert "default-src 'none'" in policy
+
+
+def test_links_within_the_page_lead_somewhere(html):
+    page = Page(html)
+    ids = [attributes["id"] for _, attributes in page.elements if "id" in attributes]
+    assert len(ids) == len(set(ids))
+    assert {link["href"][1:] for link in page.all("a")} <= set(ids)
+
+
+def test_the_page_is_readable_on_a_phone_and_in_both_colour_schemes(html):
+    assert 'name="viewport"' in html
+    assert "prefers-color-scheme: dark" in html
+    light, dark = (
+        set(re.findall(r"(--[a-z0-9-]+): #", part)) for part in html.split("prefers-color-scheme: dark")[:2]
+    )
+    assert light == dark
+    assert set(re.findall(r"var\((--[a-z0-9-]+)\)", html)) - light == {"--c"}
+    page = Page(html)
+    assert sum(attributes.get("class") == "scroll" for attributes in page.all("div")) == len(
+        page.all("table")
+    )
+
+
+def test_names_and_errors_are_escaped(sweep):
+    evil = '<script>alert("x")</script>'
+    sweep.run(evil, {"mpjpe": 60.0}, overrides=(f"name={evil}",), device=evil, commit=evil)
+    sweep.run(evil, {"mpjpe": 50.0}, overrides=("name=b",))
+    sweep.job(evil, status="failed", error=evil)
+    write_report(sweep.write(name=evil, command=evil, preset=evil))
+    html = (sweep.directory / "report.html").read_text()
+    assert not Page(html).all("script")
+    assert "&lt;script&gt;" in html
+
+
+def test_every_table_row_and_failure_is_there(html):
+    for text in (
+        "Table 3.2",
+        "proposed without EDM",
+        '<td class="thesis">24.2</td><td class="ours">60.5 <span class="sd">± 0.7</span></td><td>+36.3</td>',
+        '<td class="word">FAILED</td>',
+        "ValueError: &lt;script&gt;",
+        "holds in all 6 comparisons",
+        "python run.py",
+    ):
+        assert text in html
+
+
+def test_every_run_s_origin_is_there(html):
+    for text in (
+        "c0ffee12",
+        "0123456789</span>, with changes",
+        "feed5eed",
+        "dddd4444",
+        "1 h 02 min",
+        "1,006,757",
+    ):
+        assert text in html
+    for text in ("12,000", "aaaa1111", "embedded", "CC0"):
+        assert text in html
+
+
+def test_an_evaluation_names_the_run_that_it_evaluates(sweep):
+    checkpoint = {"path": "best.ckpt", "hash": "beef0001", "epoch": 12}
+    changes = {"trained_by": "proposed-small-1", "checkpoint": checkpoint, "num_parameters": None}
+    sweep.run("detector/cross_0px", {"mpjpe_eq38": 60.0}, **changes)
+    write_report(sweep.write("table_3_3_cross"))
+    html = (sweep.directory / "report.html").read_text()
+    assert "proposed-small-1" in html
+    assert "beef0001" in html
+
+
+def test_pictures_are_embedded_once_a_row_small_and_with_words(html):
+    images = Page(html).all("img")
+    assert len(images) == 4
+    for image in images:
+        assert image["alt"].startswith("Best, median and worst test samples of detector/")
+        data = base64.b64decode(image["src"].removeprefix("data:image/png;base64,"))
+        with Image.open(io.BytesIO(data)) as opened:
+            opened.load()
+            assert opened.size == (1600, 80)
+
+
+def test_a_damaged_picture_is_left_out_with_a_warning(sweep):
+    folder = sweep.run("detector/basic", {"mpjpe_eq38": 60.0})
+    (folder / "pictures" / "test_best_median_worst.png").write_bytes(b"\x89PNG\r\n\x1a\n cut off")
+    with pytest.warns(UserWarning, match="is left out of the report"):
+        write_report(sweep.write("table_3_2"))
+    assert not Page((sweep.directory / "report.html").read_text()).all("img")
+
+
+def test_curves_over_the_axis_have_error_bars_and_the_thesis_dashed(sweep):
+    for seed in (0, 1):
+        folder = sweep.run("detector/sigma_5px", {"mpjpe_eq38": 60.0 + seed, "pckh": 50.0}, seed)
+        (folder / "config.yaml").write_text("data:\n  keypoint_noise_px: 5\n")
+    folder = sweep.run("detector/proposed", {"mpjpe_eq38": 70.0, "pckh": 40.0})
+    (folder / "config.yaml").write_text("data:\n  keypoint_noise_px: 10\n")
+    write_report(sweep.write("table_3_3"))
+    html = (sweep.directory / "report.html").read_text()
+    assert "<title>ours, 5: 60.5 ± 0.7</title>" in html
+    assert "<title>thesis, 15: 31.4</title>" in html
+    charts = html.split('<figure class="chart">')[1:]
+    assert [re.search(r"<figcaption>([^<]*)", chart)[1] for chart in charts] == [
+        "MPJPE by σ of the 2D joints&#x27; noise, px",
+        "PCKh by σ of the 2D joints&#x27; noise, px",
+        "Validation MPJPE while training",
+    ]
+    assert 'class="bar"' in charts[0]
+    assert "dashed" in charts[0]
+
+
+def test_a_run_of_which_nothing_is_left_is_said_to_be_missing(sweep):
+    shutil.rmtree(sweep.run("detector/basic", {"mpjpe_eq38": 60.0}))
+    write_report(sweep.write("table_3_2"))
+    html = (sweep.directory / "report.html").read_text()
+    assert "MISSING run-0: it left no test metrics" in html
+    assert "no run left a record of its data" in html
+    assert not re.search(r"<td[^>]*></td>", html)
+
+
+@pytest.mark.parametrize(
+    "name", ["record.json", "config.yaml", "csv/version_0/metrics.csv", "test_errors.npz"]
+)
+@pytest.mark.parametrize("content", [None, b"", b"{", b"[1]", b"\xff\xfe\x00"])
+def test_missing_and_damaged_files_of_a_run_stop_nothing(sweep, name, content):
+    path = sweep.run("detector/proposed", {"mpjpe_eq38": 60.0, "pckh": 50.0}, errors=[1.0, 2.0]) / name
+    path.unlink() if content is None else path.write_bytes(content)
+    assert "60.0" in write_report(sweep.write("table_3_4")).text
+
+
+def test_a_sweep_without_jobs_has_a_page(sweep):
+    report = write_report(sweep.write("table_3_2"))
+    assert "missing" in report.text
+    Page((sweep.directory / "report.html").read_text())
+
+
+@pytest.fixture
+def open_in_browser(tmp_path):
+    """Opens a file in Chromium without network: the document afterwards, and the addresses that it asked for."""
+    names = ("chromium", "chromium-browser", "google-chrome")
+    browser = next((path for path in map(shutil.which, names) if path), None)
+    if browser is None:
+        pytest.skip("needs Chromium: none of chromium, chromium-browser, google-chrome is on the path")
+    options = (
+        *("headless", "no-sandbox", "disable-gpu", "no-first-run", "disable-quic", "disable-sync"),
+        *("disable-background-networking", "disable-component-update", "host-resolver-rules=MAP * ~NOTFOUND"),
+        *(f"user-data-dir={tmp_path / 'profile'}", f"log-net-log={tmp_path / 'net.json'}", "dump-dom"),
+    )
+
+    def open_file(path):
+        command = [browser, *(f"--{option}" for option in options), path.as_uri()]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
+        events = [
+            event.get("params", {}) for event in json.loads((tmp_path / "net.json").read_text())["events"]
+        ]
+        # The browser's own requests, for its updates and the like, come from no page.
+        asked = {
+            event["url"] for event in events if event.get("initiator", "not an origin") != "not an origin"
+        }
+        return done.stdout, {url for url in asked if not url.startswith(("file:", "data:"))}
+
+    return open_file
+
+
+@pytest.mark.browser
+def test_a_browser_shows_all_of_it_and_asks_for_nothing(table_3_2, open_in_browser):
+    write_report(table_3_2)
+    document, asked = open_in_browser(table_3_2 / "report.html")
+    page = Page(document)
+    assert len(page.all("table")) == 4  # Table 3.2, its comparisons, the data, the runs
+    assert len(page.all("img")) == 4
+    assert asked == set()
+
+
+@pytest.mark.browser
+def test_a_request_of_a_page_would_be_seen(tmp_path, open_in_browser):
+    path = tmp_path / "page.html"
+    path.write_text('<img src="http://elsewhere.invalid/picture.png">')
+    assert open_in_browser(path)[1] == {"http://elsewhere.invalid/picture.png"}

@@ -1,0 +1,104 @@
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from omegaconf import OmegaConf
+
+from ljn.building import build
+from ljn.report.tables import TABLES
+from ljn.tasks import records
+
+ROOT = Path(__file__).parents[2]
+SWEEPS = {path.stem: OmegaConf.load(path) for path in (ROOT / "conf" / "sweep").glob("*.yaml")}
+OF_TABLES = sorted(name for name, sweep in SWEEPS.items() if "tables" in sweep)
+NUM_TRAININGS = 17
+"""Distinct configurations behind all tables."""
+
+
+def experiments(name):
+    return [row.strip() for row in SWEEPS[name].hydra.sweeper.params.experiment.split(",")]
+
+
+@pytest.mark.parametrize("name", OF_TABLES)
+def test_a_sweep_runs_the_rows_of_its_tables(name):
+    rows = {row.experiment for table in SWEEPS[name].tables for row in TABLES[table].rows} - {None}
+    assert sorted(experiments(name)) == sorted(rows)
+
+
+def test_every_table_has_a_sweep_and_all_of_the_thesis_are_in_all_tables():
+    assert set(TABLES) == {table for name in OF_TABLES for table in SWEEPS[name].tables}
+    assert set(SWEEPS["all_tables"].tables) == set(TABLES) - {"demo"}
+
+
+def test_all_tables_train_each_distinct_configuration_once(smoke_config, tmp_path):
+    hashes = {}
+    for experiment in experiments("all_tables"):
+        cfg = smoke_config(tmp_path, f"experiment={experiment}")
+        if cfg.task._target_.endswith("train"):
+            hashes[experiment] = records.config_hash(records.identity(cfg, build(cfg.data).fingerprint))
+        else:
+            trained = smoke_config(tmp_path, f"experiment={cfg.task.trains}")
+            # What an evaluation trains is another row's run.
+            same = [cfg[group] == trained[group] for group in ("data", "model", "module", "trainer", "seed")]
+            assert all(same), experiment
+            assert cfg.task.trains in experiments("all_tables")
+            assert cfg.task.detector in (None, *experiments("all_tables"))
+    assert len(hashes) == len(set(hashes.values())) == NUM_TRAININGS
+
+
+SWEEP = (
+    *(sys.executable, "run.py", "sweep=table_3_4", "preset=smoke", "logger=csv", "data.num_workers=0"),
+    *("preset.num_train=16", "preset.num_val=4", "preset.num_test=8", "preset.max_epochs=1", "callbacks.pictures=null"),
+)
+
+
+def run_sweep(directory, *overrides):
+    command = [*SWEEP, f"paths.output_dir={directory}", *overrides]
+    environment = os.environ | {"OMP_NUM_THREADS": "1"}
+    return subprocess.Popen(
+        command, cwd=ROOT, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    )
+
+
+def numbers(directory):
+    """The metrics of each job of the sweep."""
+    sweep = json.loads((directory / "sweeps" / "table_3_4-smoke" / "sweep.json").read_text())
+    return {
+        (job["experiment"], job["seed"]): json.loads((directory / job["run_dir"] / "metrics.json").read_text())
+        for job in sweep["jobs"]
+    }
+
+
+@pytest.mark.slow
+def test_a_killed_sweep_is_finished_by_the_same_command_with_the_same_table(tmp_path):
+    whole = run_sweep(tmp_path / "whole", "seed=0,1")
+    assert whole.wait(timeout=300) == 0
+
+    killed = run_sweep(tmp_path / "killed", "seed=0,1")
+    for _ in range(3000):
+        started = list((tmp_path / "killed" / "runs").glob("*/record.json"))
+        if len(started) == 3 or killed.poll() is not None:
+            break
+        time.sleep(0.1)
+    killed.send_signal(signal.SIGKILL)
+    killed.communicate(timeout=60)
+    complete = [path for path in started if records.read_json(path)["status"] == "complete"]
+    assert len(started) == 3
+    assert len(complete) == 2
+    before = {path: path.stat().st_mtime_ns for path in complete}
+
+    again = run_sweep(tmp_path / "killed", "seed=0,1")
+    output = again.communicate(timeout=300)[0]
+    assert again.returncode == 0, output
+    assert output.count("is complete; train it again") == 2
+    assert {path: path.stat().st_mtime_ns for path in complete} == before
+    assert numbers(tmp_path / "killed") == numbers(tmp_path / "whole")
+    tables = [
+        (tmp_path / name / "sweeps" / "table_3_4-smoke" / "table.md").read_text() for name in ("killed", "whole")
+    ]
+    assert tables[0] == tables[1]
