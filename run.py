@@ -6,6 +6,7 @@ python run.py task=evaluate ckpt_path=CHECKPOINT           test a checkpoint
 python run.py task=predict input=DEPTH.png ...             joints and mesh of a depth image
 """
 
+import logging
 import os
 import sys
 
@@ -14,6 +15,7 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
 from omegaconf import DictConfig
 
+from ljn.tasks.processes import is_first_process
 from ljn.tasks.schema import register
 
 register()
@@ -22,6 +24,8 @@ register()
 @hydra.main(version_base="1.3", config_path="conf", config_name="config")
 def main(cfg: DictConfig) -> float | None:
     """Run the task that `cfg.task` names; returns the metric that `cfg.optimized_metric` names."""
+    if not is_first_process():
+        logging.disable(logging.INFO)  # the first process says it for all
     try:
         metrics = hydra.utils.get_method(cfg.task._target_)(cfg)
     except (ValueError, FileNotFoundError, ImportError, FloatingPointError) as error:
@@ -29,8 +33,9 @@ def main(cfg: DictConfig) -> float | None:
         if HydraConfig.get().mode == RunMode.MULTIRUN or os.environ.get("HYDRA_FULL_ERROR") == "1":
             raise
         sys.exit(f"error: {error}\n(HYDRA_FULL_ERROR=1 shows where it was raised)")
-    for name, value in metrics.items():
-        print(f"{name:32s}{value:10.3f}")
+    if is_first_process():
+        for name, value in metrics.items():
+            print(f"{name:32s}{value:10.3f}")
     return metrics.get(cfg.optimized_metric)
 
 

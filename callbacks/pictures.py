@@ -13,6 +13,7 @@ from lightning.pytorch.loggers import WandbLogger
 from lightning.pytorch.trainer.states import TrainerFn
 from torch import Tensor
 
+from callbacks.gathering import gather_samples
 from ljn.body.skeleton import ROOT
 from ljn.data import Batch
 from ljn.drawing import MeshSample, Sample, draw_meshes, draw_samples
@@ -80,7 +81,8 @@ class Pictures(Callback):
     ) -> None:
         """Keep the first samples."""
         missing = self.num_samples - sum(len(kept["error"]) for kept in self._validation)
-        if trainer.state.fn != TrainerFn.FITTING or not self._is_due(trainer) or missing <= 0:
+        is_wanted = trainer.is_global_zero and trainer.state.fn == TrainerFn.FITTING and self._is_due(trainer)
+        if not is_wanted or missing <= 0:
             return
         ids = {"sample_id": batch["sample_id"], "points": batch["points"][..., :3]}
         kept = self.keep(outputs, batch) | ids
@@ -110,32 +112,25 @@ class Pictures(Callback):
         dataloader_idx: int = 0,
     ) -> None:
         """Keep something of every sample."""
-        kept = self.keep(outputs, batch)
+        kept = self.keep(outputs, batch) | {"sample_id": batch["sample_id"]}
         self._test.append({name: value.detach().cpu() for name, value in kept.items()})
 
     @_never_stops
     def on_test_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Draw the best, the median and the worst samples on a page."""
         kept, self._test = self._test, []
-        if not kept:
+        samples = gather_samples(kept)
+        if not samples or not trainer.is_global_zero:
             return
-        batch_size = len(kept[0]["error"])
-        samples = _join(kept)
         order = samples["error"].nan_to_num(nan=torch.inf).argsort().tolist()
         number = min(self.num_samples, len(order))
         middle = (len(order) - number) // 2
         kinds = {"best": order[:number], "median": order[middle : middle + number], "worst": order[-number:]}
         chosen = [index for indices in kinds.values() for index in indices]
-        # Clouds are too large to keep: those of the chosen samples are read again.
-        needed = {index // batch_size for index in chosen}
-        points: dict[int, Tensor] = {}
-        for batch_idx, batch in enumerate(trainer.test_dataloaders or []):
-            if batch_idx in needed:
-                points |= {batch_idx * batch_size + row: value for row, value in enumerate(batch["points"])}
-            if batch_idx >= max(needed):
-                break
         drawn = {name: value[chosen] for name, value in samples.items()}
-        drawn["points"] = torch.stack([points[index][:, :3] for index in chosen])
+        # Clouds are too large to keep: those of the chosen samples are read again.
+        read: Any = trainer.test_dataloaders
+        drawn["points"] = read.dataset.__getitems__(drawn["sample_id"].tolist())["points"][..., :3]
         titles = [
             f"{kind}: {float(samples['error'][index]):.0f} mm"
             for kind, indices in kinds.items()

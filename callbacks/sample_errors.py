@@ -4,10 +4,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
 from torch import Tensor
 
+from callbacks.gathering import gather_samples
 from ljn.data import Batch
 from ljn.metrics.functional import joint_errors_mm
 
@@ -15,9 +15,9 @@ from ljn.metrics.functional import joint_errors_mm
 class SampleErrors(Callback):
     """Writes `test_errors.npz` after a test.
 
-    It holds, a row a sample: `sample_id` `(S,)`, `errors_mm` and `initial_errors_mm` `(S, 24)`, and `joints`,
-    `pred_joints` and `initial_joints` `(S, 24, 3)` in metres, camera frame; of a mesh regressor also `apve_mm`
-    `(S,)`, body frame, `pred_pose` `(S, 72)` and `pred_betas` `(S, 10)`.
+    It holds, a row a sample, in the order of their numbers: `sample_id` `(S,)`, `errors_mm` and
+    `initial_errors_mm` `(S, 24)`, and `joints`, `pred_joints` and `initial_joints` `(S, 24, 3)` in metres, camera
+    frame; of a mesh regressor also `apve_mm` `(S,)`, body frame, `pred_pose` `(S, 72)` and `pred_betas` `(S, 10)`.
 
     Args:
         directory: Where the file goes.
@@ -50,10 +50,10 @@ class SampleErrors(Callback):
 
     def on_test_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Write the file."""
-        if not self._batches:
+        batches, self._batches = self._batches, []
+        arrays = gather_samples(batches)
+        if not arrays or not trainer.is_global_zero:
             return
-        arrays = {name: torch.cat([batch[name] for batch in self._batches]) for name in self._batches[0]}
-        self._batches = []
         arrays["errors_mm"] = joint_errors_mm(arrays["pred_joints"], arrays["joints"]).float()
         arrays["initial_errors_mm"] = joint_errors_mm(arrays["initial_joints"], arrays["joints"]).float()
         self.path.parent.mkdir(parents=True, exist_ok=True)

@@ -7,6 +7,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, cast
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.utils.data import BatchSampler, DataLoader, Dataset, Sampler
@@ -40,7 +41,7 @@ class SyntheticDepthDataModule(BodyDataModule):
         num_train: Training samples in an epoch.
         num_val: Validation samples.
         num_test: Test samples.
-        batch_size: Samples in a batch.
+        batch_size: Samples in a batch; of a run in several processes, in all of theirs together.
         seed: Seed of the training samples' draws and order.
         pool_seed: Seed of the poses and shapes.
         eval_seed: Seed of the validation and test samples' draws.
@@ -244,15 +245,25 @@ class SyntheticDepthDataModule(BodyDataModule):
             raise RuntimeError("setup('fit') has not been called")
         sampler: Any = EpochSampler(self.sizes["train"], self.seed, self.redraw_each_epoch)
         batches = BatchSampler(sampler, self.batch_size, drop_last=len(sampler) >= self.batch_size)
-        return self._loader(SynthesizedSamples(self._train), batches)
+        return self._loader(SynthesizedSamples(self._train), SharedBatches(batches, *self._process))
 
     def val_dataloader(self) -> DataLoader:
         """The fixed validation samples."""
-        return DataLoader(self._fixed["val"], self.batch_size, collate_fn=_as_is)
+        return self._fixed_loader("val")
 
     def test_dataloader(self) -> DataLoader:
         """The fixed test samples."""
-        return DataLoader(self._fixed["test"], self.batch_size, collate_fn=_as_is)
+        return self._fixed_loader("test")
+
+    def _fixed_loader(self, split: str) -> DataLoader:
+        samples = self._fixed[split]
+        parts = fixed_batches(self.sizes[split], self.batch_size, *self._process)
+        return DataLoader(samples, batch_sampler=parts, collate_fn=_as_is)
+
+    @property
+    def _process(self) -> tuple[int, int]:
+        """This process's number among those of the run, and how many there are."""
+        return (self.trainer.global_rank, self.trainer.world_size) if self.trainer else (0, 1)
 
     def fixed_key(self, split: str) -> str:
         """Hash of everything that a fixed set depends on; a detector works on it afterwards."""
@@ -346,6 +357,51 @@ class EpochSampler(Sampler[tuple[int, int]]):
         epoch = self.epoch if self.redraws else 0
         for index in torch.randperm(self.num_samples, generator=generator).tolist():
             yield epoch, index
+
+
+class SharedBatches(Sampler[list[Any]]):
+    """One process's equal part of every batch, so that several processes take the steps that one would take.
+
+    Args:
+        batches: The whole batches.
+        process: This process's number.
+        num_processes: How many there are.
+    """
+
+    def __init__(self, batches: BatchSampler, process: int = 0, num_processes: int = 1) -> None:
+        self.batches = batches
+        self.process = process
+        self.num_processes = num_processes
+
+    @property
+    def sampler(self) -> Any:
+        """The samples' order, which the trainer tells the epoch."""
+        return self.batches.sampler
+
+    def __len__(self) -> int:
+        return len(self.batches)
+
+    def __iter__(self) -> Iterator[list[Any]]:
+        for batch in self.batches:
+            yield batch[self.process :: self.num_processes]
+
+
+def fixed_batches(size: int, batch_size: int, process: int = 0, num_processes: int = 1) -> list[list[int]]:
+    """A process's batches of the indices of a fixed set: each index in one process only, and in one batch.
+
+    All processes have the same number of batches and none is empty, since each may wait for the others in each.
+
+    Args:
+        size: Samples in the set, at least `num_processes`.
+        batch_size: Samples in the processes' batches together.
+        process: This process's number.
+        num_processes: How many there are.
+    """
+    if num_processes == 1:
+        return [list(range(start, min(start + batch_size, size))) for start in range(0, size, batch_size)]
+    own = np.array_split(np.arange(size), num_processes)[process]
+    number = min(-(-size // batch_size), size // num_processes)
+    return [part.tolist() for part in np.array_split(own, number)]
 
 
 def _pair(name: str, values: Sequence[float]) -> tuple[float, float]:

@@ -81,7 +81,8 @@ class StageModule(LightningModule):
                 "learning rate, or check the data (samples "
                 f"{batch['sample_id'].tolist()})"
             )
-        self.log("train/loss", loss, on_step=False, on_epoch=True, batch_size=len(batch["joints"]))
+        size = len(batch["joints"])
+        self.log("train/loss", loss, on_step=False, on_epoch=True, batch_size=size, sync_dist=True)
         return loss
 
     def validation_step(self, batch: Batch, batch_idx: int) -> dict[str, Tensor]:

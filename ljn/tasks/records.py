@@ -21,13 +21,22 @@ from typing import Any, Self
 
 from omegaconf import DictConfig, OmegaConf
 
+from ljn.tasks.processes import is_first_process
+
 RECORD_VERSION = 1
 
 # What may differ between two runs that are the same run; what data files hold is in the data's fingerprint.
 _NOT_IDENTITY: dict[str, tuple[str, ...]] = {
     "data": ("source", "cache_dir", "num_workers", "prefetch_batches", "body_path", "detector_ckpt"),
     "module": ("body_path",),
-    "trainer": ("accelerator", "devices", "enable_model_summary", "log_every_n_steps", "profiler"),
+    "trainer": (
+        "accelerator",
+        "devices",
+        "strategy",
+        "enable_model_summary",
+        "log_every_n_steps",
+        "profiler",
+    ),
 }
 
 
@@ -89,7 +98,8 @@ class RunRecord:
     """The record of one run, kept on disk from its first moment: a context manager.
 
     `record.json` says `running` on entry and on exit `complete`, `interrupted` (Ctrl-C, SIGTERM) or `failed`
-    with the error; after `kill -9` it still says `running`. A second attempt adds to the wall time.
+    with the error; after `kill -9` it still says `running`. A second attempt adds to the wall time. Of a run's
+    several processes, the first one alone writes.
 
     Args:
         directory: The run's directory.
@@ -98,6 +108,7 @@ class RunRecord:
 
     def __init__(self, directory: Path, facts: Mapping[str, Any]) -> None:
         self.directory = directory
+        self._writes = is_first_process()
         self._facts = dict(facts)
         before = read_json(directory / "record.json") or {}
         self._wall_time_before = float(before.get("wall_time_s") or 0.0)
@@ -136,6 +147,8 @@ class RunRecord:
             self.add(status="failed", error=f"{type(error).__name__}: {error}")
 
     def _write(self) -> None:
+        if not self._writes:
+            return
         elapsed = time.monotonic() - self._started
         self._facts["wall_time_s"] = round(self._wall_time_before + elapsed, 1)
         write_json(self.directory / "record.json", self._facts)

@@ -1,12 +1,16 @@
-"""Trackers: what they are told once, and their end."""
+"""Trackers: what they are told once, their end, and a sweep's table."""
 
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import lightning.pytorch as lightning
+from hydra.utils import get_class
 from lightning.pytorch.loggers import WandbLogger
+
+from ljn.tasks.records import config_hash
 
 
 @contextmanager
@@ -15,7 +19,9 @@ def tracking(
 ) -> Iterator[None]:
     """While it lasts, the trainer's loggers follow one run; then W&B's run is ended, as failed after an error.
 
-    Without that end, jobs of one process would share a run.
+    Without that end, jobs of one process would share a run. W&B's job type is `train` or `evaluate`; of a
+    validation metric its summary keeps the best value. An evaluation has the directory and W&B's id of its
+    training run in its config, as `trained_by` and `trained_by_id`, and in its notes.
 
     Args:
         trainer: The trainer whose loggers are meant.
@@ -23,20 +29,89 @@ def tracking(
         config: Resolved configuration, plain values.
         trained_by: For an evaluation: the training run that the checkpoint came from.
     """
-    has_wandb = any(isinstance(logger, WandbLogger) for logger in trainer.loggers)
-    # Its closing banner would bury a sweep's lines; WANDB_SILENT=false brings it back.
-    os.environ.setdefault("WANDB_SILENT", "true")
+    _quieten_wandb()
+    told = dict(config)
+    about: dict[str, Any] = {"id": run_id, "resume": "allow", "job_type": "train"}
+    if trained_by:
+        # A run's directory ends with the hash that is its id.
+        told |= {"trained_by": trained_by, "trained_by_id": trained_by.rpartition("-")[2]}
+        about |= {"job_type": "evaluate", "notes": f"Evaluation of {trained_by}"}
+    loggers = [logger for logger in trainer.loggers if isinstance(logger, WandbLogger)]
     exit_code = 1
     try:
-        for logger in trainer.loggers:
-            if isinstance(logger, WandbLogger):
-                logger._wandb_init.update(id=run_id, resume="allow")
-                logger._wandb_init.pop("anonymous", None)  # of no effect, and W&B warns of it
-            logger.log_hyperparams({**config, "trained_by": trained_by} if trained_by else dict(config))
+        for logger in loggers:
+            logger._wandb_init.update(about)
+            logger._wandb_init.pop("anonymous", None)  # of no effect, and W&B warns of it
+            for metric, summary in summaries(config).items():
+                logger.experiment.define_metric(metric, step_metric="trainer/global_step", summary=summary)
+        for each in trainer.loggers:
+            each.log_hyperparams(told)
         yield
         exit_code = 0
     finally:
-        if has_wandb:
+        if loggers:
             import wandb
 
             wandb.finish(exit_code=exit_code)
+
+
+def summaries(config: Mapping[str, Any]) -> dict[str, str]:
+    """What of a metric's values a run's summary keeps: `min` or `max`, the best one, or `last`.
+
+    A test's metrics are logged once, and are left out.
+
+    Args:
+        config: Resolved configuration, plain values, whose module says what it logs.
+    """
+    module: Any = get_class(config["module"]["_target_"])
+    kept = {None: "last", False: "min", True: "max"}
+    metrics = module.metrics(prefix="val/").items()
+    return {"train/loss": "min"} | {name: kept[metric.higher_is_better] for name, metric in metrics}
+
+
+def log_table(
+    name: str, rows: Sequence[Mapping[str, Any]], logger: Mapping[str, Any] | None, directory: str | Path
+) -> None:
+    """Log a sweep's table to W&B, as a run of its own in the sweep's group, of the job type `report`.
+
+    The table of the same name, group and project is the same run: it takes the place of the one before. Nothing
+    happens where W&B is not among the loggers.
+
+    Args:
+        name: The table's name.
+        rows: Its rows; a column for each key that any of them has. What is no number or text becomes text.
+        logger: The loggers' configuration of the sweep's jobs, plain or not: `wandb` says project, group and offline.
+        directory: Where the run's files go.
+    """
+    node = (logger or {}).get("wandb")
+    if node is None or not rows:
+        return
+    _quieten_wandb()
+    import wandb
+
+    columns = list(dict.fromkeys(key for row in rows for key in row))
+    cells = [[_cell(row.get(column)) for column in columns] for row in rows]
+    project, group = node.get("project"), node.get("group")
+    Path(directory).mkdir(parents=True, exist_ok=True)
+    with wandb.init(
+        project=project,
+        entity=node.get("entity"),
+        group=group,
+        job_type="report",
+        name=name,
+        id=config_hash({"project": project, "group": group, "table": name}),
+        resume="allow",
+        dir=str(directory),
+        mode="offline" if node.get("offline") else None,
+        reinit="create_new",
+    ) as run:
+        run.log({name: wandb.Table(columns=[*columns], data=cells, allow_mixed_types=True)})
+
+
+def _cell(value: Any) -> Any:
+    return value if value is None or isinstance(value, bool | int | float | str) else str(value)
+
+
+def _quieten_wandb() -> None:
+    # Its closing banner would bury a sweep's lines; WANDB_SILENT=false brings it back.
+    os.environ.setdefault("WANDB_SILENT", "true")

@@ -16,6 +16,7 @@ from ljn.checkpoints import AtomicCheckpointIO, Provenance, read_checkpoint
 from ljn.data import BodyDataModule
 from ljn.modules.base import StageModule
 from ljn.tasks import records
+from ljn.tasks.processes import check_trains_in_processes, is_first_process, num_processes, own_devices
 from ljn.tasks.tracking import tracking
 from ljn.tasks.validation import validate
 
@@ -26,6 +27,7 @@ _EXPECTED_WARNINGS = (
     ".*this fit will run with no optimizer",  # a yardstick
     "Checkpoint directory .* exists and is not empty",  # a resumed run
     "The number of training batches .* is smaller than the logging interval",
+    "It is recommended to use .*sync_dist=True",  # metrics gather themselves over processes
 )
 
 
@@ -58,8 +60,9 @@ def train(cfg: DictConfig) -> dict[str, float]:
 
     prepare_process(cfg)
     module = build(cfg.module)
+    check_trains_in_processes(module, num_processes(cfg.trainer))
     last, best = (run_dir / "checkpoints" / f"{name}.ckpt" for name in ("last", "best"))
-    if cfg.rerun:
+    if cfg.rerun and is_first_process():
         last.unlink(missing_ok=True)
     resumes = last.is_file()
     if resumes:
@@ -74,22 +77,28 @@ def train(cfg: DictConfig) -> dict[str, float]:
     with records.RunRecord(run_dir, facts) as record:
         config = save_config(cfg, run_dir)
         trainer = build_trainer(cfg, run_dir, config, datamodule, module)
-        record.add(device=str(trainer.strategy.root_device), num_threads=torch.get_num_threads())
+        record.add(
+            device=str(trainer.strategy.root_device),
+            num_devices=trainer.world_size,
+            num_threads=torch.get_num_threads(),
+        )
         _LOG.info(f"resuming from {last}" if resumes else f"training in {run_dir}")
         # The fixed sets first: what is wrong with them should not come up after the training.
         datamodule.setup("fit")
         datamodule.setup("test")
         with tracking(trainer, identity_hash, config):
             trainer.fit(module, datamodule, ckpt_path=last if resumes else None, weights_only=True)
-            if trainer.global_step == 0 or not best.is_file():
-                # Without optimizer steps (a yardstick) or without validation, nothing was saved yet.
+            # Without optimizer steps (a yardstick) or without validation, nothing was saved yet. All processes save
+            # together, so the first one's look at the disk counts for all.
+            if trainer.strategy.broadcast(trainer.global_step == 0 or not best.is_file()):
                 trainer.save_checkpoint(best, weights_only=False)
             record.add(checkpoint=str(best.relative_to(run_dir)))
             trainer.validate(module, datamodule, ckpt_path=best, verbose=False, weights_only=True)
             metrics = finite_metrics(trainer)
             trainer.test(module, datamodule, ckpt_path=best, verbose=False, weights_only=True)
             metrics |= finite_metrics(trainer)
-        records.write_json(run_dir / "metrics.json", metrics)
+        if trainer.is_global_zero:
+            records.write_json(run_dir / "metrics.json", metrics)
     return metrics
 
 
@@ -104,12 +113,18 @@ def set_run_directory(cfg: DictConfig, kind: str, identity_hash: str) -> Path:
 
 def prepare_process(cfg: DictConfig) -> None:
     """Seed the global generators, share the cores between PyTorch and the data workers, quieten Lightning."""
-    logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
+    for name in ("lightning.pytorch", "lightning.fabric"):
+        logging.getLogger(name).setLevel(logging.WARNING)
     for message in _EXPECTED_WARNINGS:
         warnings.filterwarnings("ignore", message)
     lightning.seed_everything(cfg.seed, workers=True, verbose=False)
     # With a thread on every core, each parallel region waits for the one that shares its core with a worker.
-    torch.set_num_threads(cfg.num_threads or max(1, _num_cores() // 2))
+    number = num_processes(cfg.trainer)
+    num_threads = cfg.num_threads or max(1, _num_cores() // (2 * number))
+    torch.set_num_threads(num_threads)
+    if number > 1:
+        # Where this is not set, Lightning gives each of several processes its share of all cores.
+        os.environ.setdefault("OMP_NUM_THREADS", str(num_threads))
 
 
 def _num_cores() -> int:
@@ -129,6 +144,8 @@ def build_trainer(
         callbacks=[*build_each(cfg.callbacks), provenance],
         logger=build_each(cfg.logger),
         plugins=[AtomicCheckpointIO()],
+        use_distributed_sampler=False,  # the data module gives each process its part, and none twice
+        **own_devices(cfg.trainer),
     )
 
 
@@ -148,7 +165,8 @@ def finite_metrics(trainer: lightning.Trainer) -> dict[str, float]:
 
 
 def save_config(cfg: DictConfig, run_dir: Path) -> dict[str, Any]:
-    """Write `config.yaml`, resolved; returns the same as plain values."""
+    """Write `config.yaml`, resolved, in the first process; returns the same as plain values."""
     config: dict[str, Any] = OmegaConf.to_container(cfg, resolve=True)  # type: ignore[assignment]
-    (run_dir / "config.yaml").write_text(OmegaConf.to_yaml(OmegaConf.create(config)))
+    if is_first_process():
+        (run_dir / "config.yaml").write_text(OmegaConf.to_yaml(OmegaConf.create(config)))
     return config

@@ -10,6 +10,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from ljn.body.skeleton import JOINT_NAMES, NUM_JOINTS
 from ljn.building import check_targets
+from ljn.tasks.processes import check_processes
 
 
 def validate(cfg: DictConfig) -> None:
@@ -27,12 +28,7 @@ def validate(cfg: DictConfig) -> None:
     _check_radii(plain.get("model") or {})
     _check_integers(plain)
     _check_monitors(plain)
-    devices = plain["trainer"].get("devices")
-    if devices not in (1, "1"):
-        raise ValueError(
-            f"trainer.devices: a run uses one device, got {devices!r}; start several runs for several devices "
-            "(each process of a multi-device run would write the same records)"
-        )
+    check_processes(plain)
     for name in ("output_dir", "cache_dir"):
         check_writable(Path(plain["paths"][name]), f"paths.{name}")
 

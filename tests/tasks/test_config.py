@@ -20,8 +20,17 @@ EXPERIMENTS = sorted(
 )
 
 
+NEEDS = {
+    "sweep=search": ("hydra_plugins.hydra_optuna_sweeper", "optuna"),
+    "logger=tensorboard": ("tensorboard",) * 2,
+}
+
+
 @pytest.mark.parametrize("choice", GROUPS + EXPERIMENTS)
 def test_every_config_composes_validates_and_builds(choice, compose_config, tmp_path):
+    if choice in NEEDS:
+        module, extra = NEEDS[choice]
+        pytest.importorskip(module, reason=f"{module} is not installed: pip install -e '.[{extra}]'")
     overrides = [choice, f"paths.output_dir={tmp_path}"]
     partners = {
         "model=ridge": "module=yardstick",
@@ -123,13 +132,6 @@ def test_a_value_of_the_wrong_type_is_rejected(compose_config):
 def test_what_types_cannot_say_is_validated(overrides, message, compose_config, tmp_path):
     cfg = compose_config(f"paths.output_dir={tmp_path}", *overrides)
     with pytest.raises(ValueError, match=message):
-        validate(cfg)
-
-
-@pytest.mark.parametrize("devices", ["2", "-1", "auto", "[0,1]"])
-def test_several_devices_are_refused(devices, compose_config, tmp_path):
-    cfg = compose_config(f"paths.output_dir={tmp_path}", f"trainer.devices={devices}")
-    with pytest.raises(ValueError, match=r"trainer\.devices: a run uses one device"):
         validate(cfg)
 
 

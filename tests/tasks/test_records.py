@@ -88,6 +88,8 @@ def test_the_identity_ignores_paths_loggers_and_workers(compose_config):
         "logger=csv",
         "data.num_workers=7",
         "trainer.accelerator=cpu",
+        "trainer.devices=2",  # what a batch is does not change with it
+        "trainer.strategy=ddp",
         "callbacks.pictures=null",
         "group=sweep",
         "num_threads=3",
