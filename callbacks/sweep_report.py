@@ -1,5 +1,6 @@
 """A sweep's results side by side: tables and a page, on disk, on the terminal and in the tracker."""
 
+import csv
 import os
 import shlex
 import sys
@@ -13,6 +14,7 @@ from omegaconf import DictConfig
 
 from ljn.report import write_report
 from ljn.tasks.records import read_json, write_json
+from ljn.tasks.tracking import log_table
 
 
 class SweepReport(Callback):
@@ -60,8 +62,13 @@ class SweepReport(Callback):
         jobs = (read_json(directory / "sweep.json") or {})["jobs"]
         runs = {str(job["run_dir"]) for job in jobs if job["run_dir"]}
         num_trained = sum(run.startswith("runs") for run in runs)
-        print(f"\n{report.text}\n\n{len(jobs)} jobs: {num_trained} trainings, {len(runs) - num_trained} evaluations")
+        print(
+            f"\n{report.text}\n\n{len(jobs)} jobs: {num_trained} trainings, {len(runs) - num_trained} evaluations"
+        )
         print("\n".join(map(str, report.paths)), flush=True)
+        with (directory / "table.csv").open(newline="", encoding="utf-8") as file:
+            rows = [{name: _as_number(value) for name, value in row.items()} for row in csv.DictReader(file)]
+        log_table(directory.name, rows, config.logger, directory)
 
     def _notes(self, config: DictConfig) -> Path:
         return Path(config.hydra.sweep.dir) / "jobs"
@@ -89,3 +96,10 @@ class SweepReport(Callback):
     def _relative(self, run_dir: str | None) -> str | None:
         """A run's directory as seen from `output_dir`, so that the whole output can be moved."""
         return None if run_dir is None else os.path.relpath(run_dir, self.output_dir)
+
+
+def _as_number(value: str) -> float | str:
+    try:
+        return float(value)
+    except ValueError:
+        return value

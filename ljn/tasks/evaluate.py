@@ -110,7 +110,8 @@ def evaluate_checkpoint(
         with tracking(trainer, identity_hash, config, trained_by=checkpoint.run):
             trainer.test(module, datamodule, verbose=False)
             metrics = finite_metrics(trainer)
-        records.write_json(run_dir / "metrics.json", metrics)
+        if trainer.is_global_zero:
+            records.write_json(run_dir / "metrics.json", metrics)
     _LOG.info("%s on %s: %s", checkpoint.run, cfg.name, run_dir)
     return metrics
 
@@ -141,7 +142,7 @@ def with_checkpoint_config(cfg: DictConfig, checkpoint: Checkpoint, overrides: l
     # What belongs to the machine rather than to the numbers stays this call's.
     of_machine = {
         "data": {name: plain["data"][name] for name in ("cache_dir", "num_workers", "prefetch_batches")},
-        "trainer": {"accelerator": plain["trainer"]["accelerator"]},
+        "trainer": {name: plain["trainer"][name] for name in ("accelerator", "devices", "strategy")},
     }
     plain |= {name: checkpoint.config[name] for name in CONFIG_GROUPS}
     plain |= {name: {**plain[name], **values} for name, values in of_machine.items()}

@@ -8,10 +8,10 @@ import pytest
 import torch
 from lightning.fabric.utilities.data import _set_sampler_epoch
 
+from datamodules.batches import EpochSampler
 from datamodules.placement import place
 from datamodules.sources.embedded import EmbeddedSource
 from datamodules.synthesis import concatenate
-from datamodules.synthetic import EpochSampler
 from ljn.body import SMPL
 from ljn.body.skeleton import ROOT
 from ljn.geometry.camera import project

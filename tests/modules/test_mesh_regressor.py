@@ -12,14 +12,16 @@ EXPERIMENTS = ("proposed", "single", "pointnet", "basic")
 def test_eight_samples_are_overfitted(experiment, compose_config, tmp_path):
     cfg = compose_config(
         *(f"experiment=mesh/{experiment}", "preset=small", f"paths.output_dir={tmp_path}"),
-        *("data.num_train=8", "data.num_points=256", "data.num_workers=0"),
+        *("data.num_train=8", "data.num_points=128", "data.num_workers=0"),
+        *("preset.mesh.num_centres=[32,8]", "preset.mesh.group_sizes=[8,8]"),
+        "preset.mesh.channels=[[32,32],[64,64]]",
     )
     torch.manual_seed(0)
     module = build(cfg.module)
     batch, _ = build(cfg.data).examples("train", range(8))
     steps = 800
-    optimizer = torch.optim.Adam(module.net.parameters())
-    schedule = OneCycleLR(optimizer, 2e-3, steps)
+    optimizer = torch.optim.Adam(module.net.parameters(), betas=(0.9, 0.99))
+    schedule = OneCycleLR(optimizer, 4e-3, steps)
     for _ in range(steps):
         optimizer.zero_grad()
         module.loss(batch).backward()

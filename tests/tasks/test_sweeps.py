@@ -53,7 +53,13 @@ def test_all_tables_train_each_distinct_configuration_once(smoke_config, tmp_pat
 
 SWEEP = (
     *(sys.executable, "run.py", "sweep=table_3_4", "preset=smoke", "logger=csv", "data.num_workers=0"),
-    *("preset.num_train=16", "preset.num_val=4", "preset.num_test=8", "preset.max_epochs=1", "callbacks.pictures=null"),
+    *(
+        "preset.num_train=16",
+        "preset.num_val=4",
+        "preset.num_test=8",
+        "preset.max_epochs=1",
+        "callbacks.pictures=null",
+    ),
 )
 
 
@@ -69,7 +75,9 @@ def numbers(directory):
     """The metrics of each job of the sweep."""
     sweep = json.loads((directory / "sweeps" / "table_3_4-smoke" / "sweep.json").read_text())
     return {
-        (job["experiment"], job["seed"]): json.loads((directory / job["run_dir"] / "metrics.json").read_text())
+        (job["experiment"], job["seed"]): json.loads(
+            (directory / job["run_dir"] / "metrics.json").read_text()
+        )
         for job in sweep["jobs"]
     }
 
@@ -99,6 +107,7 @@ def test_a_killed_sweep_is_finished_by_the_same_command_with_the_same_table(tmp_
     assert {path: path.stat().st_mtime_ns for path in complete} == before
     assert numbers(tmp_path / "killed") == numbers(tmp_path / "whole")
     tables = [
-        (tmp_path / name / "sweeps" / "table_3_4-smoke" / "table.md").read_text() for name in ("killed", "whole")
+        (tmp_path / name / "sweeps" / "table_3_4-smoke" / "table.md").read_text()
+        for name in ("killed", "whole")
     ]
     assert tables[0] == tables[1]
