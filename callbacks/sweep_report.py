@@ -1,5 +1,6 @@
 """A sweep's results side by side: tables and a page, on disk, on the terminal and in the tracker."""
 
+import atexit
 import csv
 import os
 import shlex
@@ -14,7 +15,6 @@ from omegaconf import DictConfig
 
 from ljn.report import write_report
 from ljn.tasks.records import read_json, write_json
-from ljn.tasks.tracking import log_table
 
 
 class SweepReport(Callback):
@@ -53,11 +53,29 @@ class SweepReport(Callback):
         write_json(notes / f"{int(config.hydra.job.num):04d}.json", note)
         write_report(self._gather(config), is_final=False)
 
+    def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
+        """See to it that the sweep is summed up however it ends: after a failed job, Hydra says nothing of its end."""
+        self._sweep = config
+        atexit.register(self._sum_up)
+
     def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
-        """Write and print the tables of all jobs, and the page."""
-        if not self._notes(config).is_dir():  # not one job came to its end
+        """Sum the sweep up, also in the tracker."""
+        atexit.unregister(self._sum_up)
+        directory = self._sum_up()
+        if directory is None:
             return
-        directory = self._gather(config)
+        # Not above: Hydra imports this file for every call, also for one that should not load PyTorch.
+        from ljn.tasks.tracking import log_table
+
+        with (directory / "table.csv").open(newline="", encoding="utf-8") as file:
+            rows = [{name: _as_number(value) for name, value in row.items()} for row in csv.DictReader(file)]
+        log_table(directory.name, rows, config.logger, directory)
+
+    def _sum_up(self) -> Path | None:
+        """Write and print the tables of all jobs, and the page; returns their directory."""
+        if not self._notes(self._sweep).is_dir():  # not one job came to its end
+            return None
+        directory = self._gather(self._sweep)
         report = write_report(directory)
         jobs = (read_json(directory / "sweep.json") or {})["jobs"]
         runs = {str(job["run_dir"]) for job in jobs if job["run_dir"]}
@@ -66,9 +84,7 @@ class SweepReport(Callback):
             f"\n{report.text}\n\n{len(jobs)} jobs: {num_trained} trainings, {len(runs) - num_trained} evaluations"
         )
         print("\n".join(map(str, report.paths)), flush=True)
-        with (directory / "table.csv").open(newline="", encoding="utf-8") as file:
-            rows = [{name: _as_number(value) for name, value in row.items()} for row in csv.DictReader(file)]
-        log_table(directory.name, rows, config.logger, directory)
+        return directory
 
     def _notes(self, config: DictConfig) -> Path:
         return Path(config.hydra.sweep.dir) / "jobs"

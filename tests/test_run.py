@@ -88,7 +88,7 @@ def test_a_failing_job_costs_the_others_nothing_and_is_printed_as_failed(tmp_pat
         env=os.environ | {"OMP_NUM_THREADS": "1"},
     )
     assert done.returncode == 1
-    jobs = json.loads((tmp_path / "sweeps" / "demo-smoke" / "sweep.json").read_text())["jobs"]
+    jobs = json.loads((tmp_path / "sweeps" / "demo" / "sweep.json").read_text())["jobs"]
     assert [job["status"] for job in jobs] == ["complete", "failed", "complete"]
     assert "group_size: expected" in jobs[1]["error"]
     assert re.search(r"proposed.*failed", done.stdout, re.IGNORECASE)

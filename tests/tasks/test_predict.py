@@ -122,7 +122,9 @@ def test_a_damaged_frame_of_a_folder_is_reported_and_costs_the_others_nothing(fo
     summary = json.loads((outputs / "predictions.json").read_text())
     assert (summary["predict/frames"], summary["predict/failed"]) == (2, 1)
     assert "is damaged" in summary["frames"]["b"]["error"]
-    assert summary["frames"]["a"]["median_distance_mm"] == summary["frames"]["c"]["median_distance_mm"]
+    # The same image twice, in one batch: apart from rounding, the same result.
+    distances = [summary["frames"][name]["median_distance_mm"] for name in "ac"]
+    assert distances[0] == pytest.approx(distances[1], rel=1e-4)
 
 
 def test_keypoints_that_are_missing_for_a_frame_fail_that_frame(folders, config, tmp_path):
