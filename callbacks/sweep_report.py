@@ -78,10 +78,10 @@ class SweepReport(Callback):
         directory = self._gather(self._sweep)
         report = write_report(directory)
         jobs = (read_json(directory / "sweep.json") or {})["jobs"]
-        runs = {str(job["run_dir"]) for job in jobs if job["run_dir"]}
-        num_trained = sum(run.startswith("runs") for run in runs)
+        directories = {str(job["run_dir"]) for job in jobs if job["run_dir"]}
+        num_runs = sum(run.startswith("runs") for run in directories)
         print(
-            f"\n{report.text}\n\n{len(jobs)} jobs: {num_trained} trainings, {len(runs) - num_trained} evaluations"
+            f"\n{report.text}\n\n{len(jobs)} jobs: {num_runs} runs, {len(directories) - num_runs} evaluations"
         )
         print("\n".join(map(str, report.paths)), flush=True)
         return directory
@@ -97,6 +97,11 @@ class SweepReport(Callback):
         name = chosen or f"grid-{Path(config.hydra.sweep.dir).name}"
         directory = self.output_dir / "sweeps" / (name if name == preset else f"{name}-{preset}")
         directory.mkdir(parents=True, exist_ok=True)
+        jobs = [note for path in sorted(self._notes(config).glob("*.json")) if (note := read_json(path))]
+        # What earlier calls have done stays in the tables: other seeds, and what this call has not reached.
+        earlier = (read_json(directory / "sweep.json") or {}).get("jobs", [])
+        known = {_key(job) for job in jobs}
+        jobs += [job for job in earlier if job["status"] == "complete" and _key(job) not in known]
         content = {
             "name": name,
             "preset": preset,
@@ -112,6 +117,11 @@ class SweepReport(Callback):
     def _relative(self, run_dir: str | None) -> str | None:
         """A run's directory as seen from `output_dir`, so that the whole output can be moved."""
         return None if run_dir is None else os.path.relpath(run_dir, self.output_dir)
+
+
+def _key(job: dict[str, Any]) -> tuple[Any, ...]:
+    """What makes two jobs the same one."""
+    return job["experiment"], job["seed"], tuple(sorted(job["overrides"]))
 
 
 def _as_number(value: str) -> float | str:

@@ -103,8 +103,12 @@ class Checkpoint:
         return sorted(set(hashes) - set(self.body_hash.split("-")))
 
 
-def read_checkpoint(path: str | Path) -> Checkpoint:
+def read_checkpoint(path: str | Path, name: str = "ckpt_path") -> Checkpoint:
     """Read a checkpoint.
+
+    Args:
+        path: The file.
+        name: The argument to name in errors.
 
     Raises:
         FileNotFoundError: There is no such file.
@@ -113,26 +117,26 @@ def read_checkpoint(path: str | Path) -> Checkpoint:
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(
-            f"ckpt_path: no file '{path}'; a run keeps its best checkpoint in RUN_DIRECTORY/checkpoints/best.ckpt"
+            f"{name}: no file '{path}'; a run keeps its best checkpoint in RUN_DIRECTORY/checkpoints/best.ckpt"
         )
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
     except _READ_ERRORS as error:
         reason = str(error).strip().split("\n")[0]
         raise ValueError(
-            f"ckpt_path: '{path}' is damaged, truncated or no checkpoint at all ({reason}); copy it again, or "
+            f"{name}: '{path}' is damaged, truncated or no checkpoint at all ({reason}); copy it again, or "
             "use another one of the run"
         ) from error
     provenance: Any = content.get(_PROVENANCE_KEY) if isinstance(content, dict) else None
     if not _is_ours(content, provenance):
         raise ValueError(
-            f"ckpt_path: '{path}' is a PyTorch file, but no checkpoint that a run of this library wrote: it "
+            f"{name}: '{path}' is a PyTorch file, but no checkpoint that a run of this library wrote: it "
             "carries no whole configuration"
         )
     if provenance["version"] != CHECKPOINT_VERSION:
         newer = provenance["version"] > CHECKPOINT_VERSION
         raise ValueError(
-            f"ckpt_path: '{path}' was written by {'a newer' if newer else 'an older'} version of this library "
+            f"{name}: '{path}' was written by {'a newer' if newer else 'an older'} version of this library "
             f"(checkpoint version {provenance['version']}, this one reads {CHECKPOINT_VERSION}); "
             + (
                 "update the library"
@@ -205,7 +209,7 @@ def load_module(path: str | Path, kind: type[StageModule], name: str = "ckpt_pat
         FileNotFoundError: There is no such file.
         ValueError: See `read_checkpoint` and `load_state`; or the checkpoint is of another kind.
     """
-    checkpoint = read_checkpoint(path)
+    checkpoint = read_checkpoint(path, name)
     module = build(checkpoint.config["module"])
     if not isinstance(module, kind):
         raise ValueError(

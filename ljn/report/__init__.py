@@ -1,5 +1,6 @@
 """A finished sweep as tables (CSV, Markdown, LaTeX, plain text) and one HTML page, the thesis's numbers beside ours."""
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -50,7 +51,9 @@ def write_report(directory: Path, is_final: bool = True) -> Report:
     paths = []
     for name, content in contents.items():
         path = directory / name
-        draft = path.with_name(f"{name}.tmp")
+        draft = path.with_name(
+            f"{name}.{os.getpid()}.tmp"
+        )  # jobs side by side write, each in a process of its own
         draft.write_text(content, encoding="utf-8")
         draft.replace(path)
         paths.append(path)

@@ -162,7 +162,7 @@ def _data(run: Run) -> str:
     if not run.data:
         return _MISSING
     version = run.data.get("version")
-    detector = run.data.get("detector")
+    detector = _dict(run.data.get("detector")).get("hash")
     parts = [
         f"{text(run.data.get('source'))} v{escape(str(version))}"
         if version is not None

@@ -217,7 +217,11 @@ def to_csv(results: Results) -> str:
                         "thesis": cell.thesis,
                         "difference": cell.difference,
                         "status": row.status,
-                        "run_dirs": ";".join(str(run.directory) for run in row.runs if run.directory),
+                        "run_dirs": ";".join(
+                            f"{run.directory.parent.name}/{run.directory.name}"
+                            for run in row.runs
+                            if run.directory
+                        ),
                     }
                 )
     return buffer.getvalue()

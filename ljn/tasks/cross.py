@@ -9,6 +9,12 @@ from omegaconf import DictConfig, open_dict
 from ljn.tasks.evaluate import evaluate_checkpoint
 from ljn.tasks.train import train
 
+# Of what was typed, what means the detector, too; of a sweep, the sizes that it sets.
+_SHARED = (
+    "sweep=", "preset", "seed=", "body", "data", "trainer", "paths", "logger", "num_threads=", "tags=", "group=",
+)  # fmt: skip
+_OF_STAGE_2 = ("data.initial_joints", "data.joint_noise", "data.detector_ckpt")
+
 
 def cross(cfg: DictConfig) -> dict[str, float]:
     """Train a configuration, or find it trained, then test its best checkpoint on changed data.
@@ -47,7 +53,7 @@ def _trained(cfg: DictConfig, name: str) -> Path:
 
 
 def _composed(cfg: DictConfig, experiment: str) -> DictConfig:
-    """This call's configuration with another experiment in place of its own."""
+    """The configuration of another experiment with this call's sizes, data, trainer and the like."""
     typed = HydraConfig.get().overrides.task
-    kept = [line for line in typed if not line.lstrip("+~").startswith(("experiment=", "task"))]
+    kept = [line for line in typed if line.startswith(_SHARED) and not line.startswith(_OF_STAGE_2)]
     return compose("config", [f"experiment={experiment}", *kept])

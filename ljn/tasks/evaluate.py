@@ -177,9 +177,9 @@ def _set(cfg: DictConfig, key: str, value: Any, line: str | None) -> None:
     OmegaConf.update(cfg, key, value)
     if key.startswith("body."):
         # The stored config is resolved: what was derived from the body's group has to follow by hand.
-        OmegaConf.update(
-            cfg, {"body.path": "data.body_path", "body.genders": "data.source.genders"}[key], value
-        )
+        for derived in _OF_BODY[key]:
+            if OmegaConf.select(cfg, derived, default=_MISSING) is not _MISSING:
+                OmegaConf.update(cfg, derived, value)
 
 
 _OF_BODY = {

@@ -6,13 +6,15 @@ finds it again: to resume it, to skip it, or to share it.
 
 import hashlib
 import json
+import logging
 import math
 import os
 import platform
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from datetime import UTC, datetime
 from importlib.metadata import version
 from pathlib import Path
@@ -24,6 +26,7 @@ from omegaconf import DictConfig, OmegaConf
 from ljn.tasks.processes import is_first_process
 
 RECORD_VERSION = 1
+_LOG = logging.getLogger(__name__)
 
 # What may differ between two runs that are the same run; what data files hold is in the data's fingerprint.
 _NOT_IDENTITY: dict[str, tuple[str, ...]] = {
@@ -152,6 +155,28 @@ class RunRecord:
         elapsed = time.monotonic() - self._started
         self._facts["wall_time_s"] = round(self._wall_time_before + elapsed, 1)
         write_json(self.directory / "record.json", self._facts)
+
+
+@contextmanager
+def alone_in(directory: Path) -> Iterator[None]:
+    """While it lasts, no other run works in a directory: of two equal runs side by side, the second one waits.
+
+    The lock ends with its process, however that ends. It holds between machines where their shared disk locks files.
+    A run's further processes share the lock of the first.
+    """
+    if not is_first_process():
+        yield
+        return
+    import fcntl
+
+    directory.mkdir(parents=True, exist_ok=True)
+    with (directory / ".lock").open("w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            _LOG.info("%s: another process is at this run; waiting for it", directory)
+            fcntl.flock(file, fcntl.LOCK_EX)
+        yield
 
 
 def is_complete(directory: Path, identity_hash: str) -> bool:

@@ -54,10 +54,16 @@ def train(cfg: DictConfig) -> dict[str, float]:
     datamodule.prepare_data()
     identity_hash = records.config_hash(records.identity(cfg, datamodule.fingerprint))
     run_dir = set_run_directory(cfg, "runs", identity_hash)
-    if records.is_complete(run_dir, identity_hash) and not cfg.rerun:
-        _LOG.info("%s is complete; train it again with rerun=true", run_dir)
-        return records.read_json(run_dir / "metrics.json") or {}
+    with records.alone_in(run_dir):
+        if records.is_complete(run_dir, identity_hash) and not cfg.rerun:
+            _LOG.info("%s is complete; train it again with rerun=true", run_dir)
+            return records.read_json(run_dir / "metrics.json") or {}
+        return _train(cfg, datamodule, run_dir, identity_hash)
 
+
+def _train(
+    cfg: DictConfig, datamodule: BodyDataModule, run_dir: Path, identity_hash: str
+) -> dict[str, float]:
     prepare_process(cfg)
     module = build(cfg.module)
     check_trains_in_processes(module, num_processes(cfg.trainer))

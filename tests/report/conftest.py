@@ -68,7 +68,7 @@ RECORD = {
         "sizes": {"train": 12000, "val": 500, "test": 2000},
         "pool": {"train": "aaaa1111", "val": "bbbb2222", "test": "cccc3333"},
         "bodies": {"female": "dddd4444", "male": "eeee5555"},
-        "detector": None,
+        "detector": {"path": "outputs/runs/detector/checkpoints/best.ckpt", "hash": "d37ec70rd37ec70r"},
         "seeds": {"seed": 0},
     },
 }

@@ -146,6 +146,15 @@ def test_overrides_change_data_and_nothing_that_the_checkpoint_decides(trained, 
         with_checkpoint_config(cfg, checkpoint, ["data.num_pionts=3"])
 
 
+def test_other_bodies_reach_all_that_was_made_of_the_bodies_group(write_checkpoint, smoke_config, tmp_path):
+    checkpoint = read_checkpoint(write_checkpoint("mesh/proposed"))
+    typed = ["body.path=bodies", "body.genders=[male]", "body.predicted=male"]
+    merged = with_checkpoint_config(smoke_config(tmp_path), checkpoint, typed)
+    assert (merged.data.body_path, merged.module.body_path) == ("bodies", "bodies")
+    assert (merged.data.source.genders, merged.module.genders) == (["male"], ["male"])
+    assert merged.module.predicted == "male"
+
+
 def test_bodies_can_be_given_as_other_files_with_the_same_content(trained, run_py, body_models, tmp_path):
     (tmp_path / "bodies").mkdir()
     for body in body_models:

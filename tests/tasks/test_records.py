@@ -2,10 +2,12 @@ import json
 import signal
 import subprocess
 import sys
+import threading
+import time
 
 import pytest
 
-from ljn.tasks.records import RunRecord, config_hash, identity, is_complete, read_json, write_json
+from ljn.tasks.records import RunRecord, alone_in, config_hash, identity, is_complete, read_json, write_json
 
 
 def test_a_record_says_running_then_complete(tmp_path):
@@ -108,3 +110,19 @@ def test_the_identity_ignores_paths_loggers_and_workers(compose_config):
     ):
         assert hash_of(override) != same, override
     assert config_hash(identity(compose_config("experiment=detector/proposed"), "other")) != same
+
+
+def test_a_second_run_in_a_directory_waits_for_the_first(tmp_path):
+    order = []
+
+    def second():
+        with alone_in(tmp_path / "run"):
+            order.append("second")
+
+    with alone_in(tmp_path / "run"):
+        thread = threading.Thread(target=second)
+        thread.start()
+        time.sleep(0.3)
+        order.append("first")
+    thread.join(10)
+    assert order == ["first", "second"]
