@@ -111,3 +111,20 @@ def test_a_killed_sweep_is_finished_by_the_same_command_with_the_same_table(tmp_
         for name in ("killed", "whole")
     ]
     assert tables[0] == tables[1]
+
+
+@pytest.mark.slow
+def test_the_chain_takes_the_detector_and_the_mesh_regressor_of_the_other_rows(run_py, tmp_path):
+    sizes = [word for word in SWEEP if word.startswith(("preset", "logger", "data", "callbacks"))]
+    done = run_py(
+        "sweep=table_3_6", *sizes, "experiment=mesh/proposed,mesh/chain", f"paths.output_dir={tmp_path}"
+    )
+    assert "2 jobs: 1 runs, 1 evaluations" in done.stdout
+    assert sorted(path.name.rpartition("-smoke")[0] for path in (tmp_path / "runs").iterdir()) == [
+        "detector-proposed",
+        "mesh-proposed",
+    ]
+    [record] = [json.loads(path.read_text()) for path in (tmp_path / "evaluations").glob("*/record.json")]
+    [detector] = (tmp_path / "runs").glob("detector-proposed-*/checkpoints/best.ckpt")
+    assert record["data"]["detector"]["path"] == str(detector)
+    assert record["trained_by"].startswith("mesh-proposed-smoke-")
