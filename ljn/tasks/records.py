@@ -51,7 +51,12 @@ def identity(cfg: DictConfig, data_fingerprint: str) -> dict[str, Any]:
         data_fingerprint: See `BodyDataModule.fingerprint`.
     """
     plain: dict[str, Any] = OmegaConf.to_container(cfg, resolve=True)  # type: ignore[assignment]
-    kept: dict[str, Any] = {"seed": plain["seed"], "data_fingerprint": data_fingerprint}
+    # The metric chooses the best epoch.
+    kept: dict[str, Any] = {
+        "seed": plain["seed"],
+        "optimized_metric": plain["optimized_metric"],
+        "data_fingerprint": data_fingerprint,
+    }
     for group in ("data", "model", "module", "trainer"):
         dropped = _NOT_IDENTITY.get(group, ())
         kept[group] = {key: value for key, value in plain[group].items() if key not in dropped}

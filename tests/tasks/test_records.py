@@ -107,6 +107,7 @@ def test_the_identity_ignores_paths_loggers_and_workers(compose_config):
         "model.edm=false",
         "module.optimizer.lr=0.1",
         "trainer.max_epochs=1",
+        "optimized_metric=val/pckh",
     ):
         assert hash_of(override) != same, override
     assert config_hash(identity(compose_config("experiment=detector/proposed"), "other")) != same
