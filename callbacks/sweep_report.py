@@ -107,9 +107,7 @@ class SweepReport(Callback):
             "preset": preset,
             "tables": list(config.tables),
             "command": shlex.join(["python", "run.py", *sys.argv[1:]]),
-            "jobs": [
-                note for path in sorted(self._notes(config).glob("*.json")) if (note := read_json(path))
-            ],
+            "jobs": jobs,
         }
         write_json(directory / "sweep.json", content)
         return directory
@@ -120,8 +118,8 @@ class SweepReport(Callback):
 
 
 def _key(job: dict[str, Any]) -> tuple[Any, ...]:
-    """What makes two jobs the same one."""
-    return job["experiment"], job["seed"], tuple(sorted(job["overrides"]))
+    """What makes two jobs the same one: a run's directory is named by all that its numbers depend on."""
+    return job["experiment"], job["run_dir"]
 
 
 def _as_number(value: str) -> float | str:

@@ -38,7 +38,7 @@ def cross(cfg: DictConfig) -> dict[str, float]:
         )
     overrides = list(task.overrides)
     if task.detector is not None:
-        detector = _trained(_composed(cfg, task.detector), task.detector)
+        detector = _trained(_composed(task.detector), task.detector)
         overrides += ["data.initial_joints=detector", f"data.detector_ckpt='{detector}'"]
     return evaluate_checkpoint(cfg, _trained(cfg.copy(), task.trains), overrides, cfg.name, reuses=True)
 
@@ -52,7 +52,7 @@ def _trained(cfg: DictConfig, name: str) -> Path:
     return Path(cfg.paths.run_dir) / "checkpoints" / "best.ckpt"
 
 
-def _composed(cfg: DictConfig, experiment: str) -> DictConfig:
+def _composed(experiment: str) -> DictConfig:
     """The configuration of another experiment with this call's sizes, data, trainer and the like."""
     typed = HydraConfig.get().overrides.task
     kept = [line for line in typed if line.startswith(_SHARED) and not line.startswith(_OF_STAGE_2)]
