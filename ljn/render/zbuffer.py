@@ -40,7 +40,7 @@ def _rasterise(
     later = np.empty(faces.shape[0], np.int64)
     num_later = 0
     for f in range(faces.shape[0]):
-        a, b, c = corners[faces[f, 0]], corners[faces[f, 1]], corners[faces[f, 2]]
+        a, b, c = _corner(corners, faces[f, 0]), _corner(corners, faces[f, 1]), _corner(corners, faces[f, 2])
         area = (b[0] - a[0]) * (c[1] - a[1]) - (c[0] - a[0]) * (b[1] - a[1])
         if area > 0.0 and face_ids is None:
             later[num_later] = f
@@ -49,7 +49,8 @@ def _rasterise(
             _draw_face(f, a, b, c, area, buffer, face_ids)
     for i in range(num_later):
         f = later[i]
-        _draw_face(f, corners[faces[f, 0]], corners[faces[f, 1]], corners[faces[f, 2]], 1.0, buffer, face_ids)
+        a, b, c = _corner(corners, faces[f, 0]), _corner(corners, faces[f, 1]), _corner(corners, faces[f, 2])
+        _draw_face(f, a, b, c, 1.0, buffer, face_ids)
 
     left = min(max(math.floor(corners[:, 0].min()), 0), width)
     top = min(max(math.floor(corners[:, 1].min()), 0), height)
@@ -62,12 +63,18 @@ def _rasterise(
                 buffer[v, u] = 0.0
 
 
-@numba.njit(cache=True, nogil=True, inline="always")
+@numba.njit(cache=True, nogil=True)
+def _corner(corners: np.ndarray, i: int) -> tuple[float, float, float]:
+    """Row `i`, as numbers: a view of it would be counted up and down."""
+    return corners[i, 0], corners[i, 1], corners[i, 2]
+
+
+@numba.njit(cache=True, nogil=True)
 def _draw_face(
     face: int,
-    a: np.ndarray,
-    b: np.ndarray,
-    c: np.ndarray,
+    a: tuple[float, float, float],
+    b: tuple[float, float, float],
+    c: tuple[float, float, float],
     area: float,
     buffer: np.ndarray,
     face_ids: np.ndarray | None,
@@ -79,9 +86,9 @@ def _draw_face(
     the last bit, so that no pixel falls through a shared edge.
     """
     height, width = buffer.shape
-    ua, va, wa = a[0], a[1], a[2]
-    ub, vb, wb = b[0], b[1], b[2]
-    uc, vc, wc = c[0], c[1], c[2]
+    ua, va, wa = a
+    ub, vb, wb = b
+    uc, vc, wc = c
     u0 = max(math.ceil(min(ua, ub, uc)), 0)
     u1 = min(math.floor(max(ua, ub, uc)), width - 1)
     v0 = max(math.ceil(min(va, vb, vc)), 0)

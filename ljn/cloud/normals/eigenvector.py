@@ -14,37 +14,67 @@ def smallest_eigenvector(
     The eigenvalue by the trigonometric solution of the cubic, the vector as the longest cross product of two
     rows of A - lambda I.
     """
+    xx, xy, xz, yy, yz, zz, spread, cosine = scaled(xx, xy, xz, yy, yz, zz)
+    return null_vector(xx, xy, xz, yy, yz, zz, smallest_eigenvalue(spread, cosine))
+
+
+# The parts of the solution. Those without a branch, of which a loop over many matrices makes vector instructions,
+# divide by zero where what comes of it is not used.
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def scaled(
+    xx: float, xy: float, xz: float, yy: float, yz: float, zz: float
+) -> tuple[float, float, float, float, float, float, float, float]:
+    """The matrix at a trace of 1, and the two numbers that its eigenvalues follow from."""
     trace = xx + yy + zz
-    if trace <= 0.0:
-        return 0.0, 0.0, 0.0
-    xx, xy, xz, yy, yz, zz = xx / trace, xy / trace, xz / trace, yy / trace, yz / trace, zz / trace
-    mean = 1.0 / 3.0
-    a, b, c = xx - mean, yy - mean, zz - mean
+    scale = 1.0 / trace if trace > 0.0 else 0.0
+    equal = 0.0 if trace > 0.0 else 1.0 / 3.0  # a matrix of zeros has equal eigenvalues, at a trace of 1 too
+    xx, xy, xz, yy, yz, zz = (
+        xx * scale + equal,
+        xy * scale,
+        xz * scale,
+        yy * scale + equal,
+        yz * scale,
+        zz * scale + equal,
+    )
+    a, b, c = xx - 1.0 / 3.0, yy - 1.0 / 3.0, zz - 1.0 / 3.0
     spread = math.sqrt((a * a + b * b + c * c + 2.0 * (xy * xy + xz * xz + yz * yz)) / 6.0)
-    if spread < 1e-12:
-        return 0.0, 0.0, 0.0
     determinant = a * (b * c - yz * yz) - xy * (xy * c - yz * xz) + xz * (xy * yz - b * xz)
-    angle = math.acos(min(1.0, max(-1.0, determinant / (2.0 * spread**3)))) / 3.0
-    smallest = mean + 2.0 * spread * math.cos(angle + 2.0 * math.pi / 3.0)
-    a, b, c = xx - smallest, yy - smallest, zz - smallest
-    best = 0.0
-    nx = ny = nz = 0.0
-    for pair in range(3):
-        if pair == 0:
-            x, y, z = xy * yz - xz * b, xz * xy - a * yz, a * b - xy * xy
-        elif pair == 1:
-            x, y, z = xy * c - xz * yz, xz * xz - a * c, a * yz - xy * xz
-        else:
-            x, y, z = b * c - yz * yz, yz * xz - xy * c, xy * yz - b * xz
-        length = x * x + y * y + z * z
-        if length > best:
-            best, nx, ny, nz = length, x, y, z
+    cosine = determinant / (2.0 * spread * spread * spread) if spread > 1e-12 else 0.0
+    cosine = cosine if cosine < 1.0 else 1.0
+    cosine = cosine if cosine > -1.0 else -1.0
+    return xx, xy, xz, yy, yz, zz, spread, cosine
+
+
+@numba.njit(cache=True, nogil=True)
+def smallest_eigenvalue(spread: float, cosine: float) -> float:
+    """The smallest eigenvalue of a matrix that `scaled` gave with these two."""
+    return 1.0 / 3.0 + 2.0 * spread * math.cos((math.acos(cosine) + 2.0 * math.pi) / 3.0)
+
+
+@numba.njit(cache=True, nogil=True, error_model="numpy")
+def null_vector(
+    xx: float, xy: float, xz: float, yy: float, yz: float, zz: float, eigenvalue: float
+) -> tuple[float, float, float]:
+    """Unit eigenvector of an eigenvalue of a matrix whose trace is 1; zeros where it is not unique."""
+    a, b, c = xx - eigenvalue, yy - eigenvalue, zz - eigenvalue
+    x0, y0, z0 = xy * yz - xz * b, xz * xy - a * yz, a * b - xy * xy
+    x1, y1, z1 = xy * c - xz * yz, xz * xz - a * c, a * yz - xy * xz
+    x2, y2, z2 = b * c - yz * yz, yz * xz - xy * c, xy * yz - b * xz
+    best, second, third = (
+        x0 * x0 + y0 * y0 + z0 * z0,
+        x1 * x1 + y1 * y1 + z1 * z1,
+        x2 * x2 + y2 * y2 + z2 * z2,
+    )
+    x, y, z = (x1, y1, z1) if second > best else (x0, y0, z0)
+    best = second if second > best else best
+    x, y, z = (x2, y2, z2) if third > best else (x, y, z)
+    best = third if third > best else best
     # `best` is the squared gap between the two smallest eigenvalues, at a trace of 1. The arc cosine knows these
     # to 1e-8 where they agree (points on a line), so that a smaller gap says nothing.
-    if best < 1e-12:
-        return 0.0, 0.0, 0.0
-    length = math.sqrt(best)
-    return nx / length, ny / length, nz / length
+    scale = 1.0 / math.sqrt(best) if best >= 1e-12 else 0.0
+    return x * scale, y * scale, z * scale
 
 
 @numba.njit(cache=True, nogil=True)
