@@ -108,17 +108,32 @@ def compare(columns: Sequence[Column], contenders: Sequence[Sequence[Contender]]
     return tuple(comparisons)
 
 
-def verdict(comparisons: Sequence[Comparison]) -> tuple[bool | None, str]:
-    """Whether the thesis's ordering holds, and that in words; None where there is nothing to compare."""
+def count_claims(column: Column, rows: Sequence[Contender]) -> int:
+    """How many pairs of rows the thesis puts in an order in a column, with results or without."""
+    known = [row.thesis for row in rows if row.thesis is not None]
+    return sum(first != second for first, second in combinations(known, 2)) if column.goal else 0
+
+
+def verdict(comparisons: Sequence[Comparison], num_claims: int) -> tuple[bool | None, str]:
+    """Whether the thesis's ordering holds, in words too.
+
+    Args:
+        comparisons: Of one or more columns; see `compare`.
+        num_claims: Of these columns; see `count_claims`.
+
+    Returns:
+        None, not True, where nothing speaks against it but rows are without a result.
+    """
     claims = [comparison for comparison in comparisons if comparison.is_claim]
     if not claims:
         return None, "not judged: no two rows have both a result and a number of the thesis"
+    number = f"{len(claims)} comparisons" if len(claims) > 1 else "the one comparison"
+    missing = num_claims - len(claims)
+    without = f"; {missing} more want a result" if missing else ""
     failing = sum(not comparison.holds for comparison in claims)
-    if not failing:
-        return True, f"holds in all {len(claims)} comparisons" if len(
-            claims
-        ) > 1 else "holds in the one comparison"
-    return False, f"does not hold in {failing} of {len(claims)} comparisons"
+    if failing:
+        return False, f"does not hold in {failing} of {number}{without}"
+    return None if missing else True, f"holds in {'all ' if len(claims) > 1 else ''}{number}{without}"
 
 
 def paired_bootstrap(
@@ -171,20 +186,20 @@ def _best_and_others(
 
 def _interval(better: Contender, worse: Contender) -> tuple[float, float] | None:
     first, second = _mean_errors(better), _mean_errors(worse)
-    if first is None or second is None or not np.array_equal(first[0], second[0]) or not len(first[0]):
+    if first is None or second is None or not len(first[0]) or not np.array_equal(first[0], second[0]):
         return None
     return paired_bootstrap(first[1], second[1])
 
 
 def _mean_errors(row: Contender) -> tuple[np.ndarray, np.ndarray] | None:
-    """Sample ids and errors (mm) of a row, each sample's mean over its runs."""
+    """A row's samples and their errors (mm), each sample's mean over the runs; see `Run.sample_errors`."""
     if row.metric is None:
         return None
     found = [run.sample_errors(row.metric) for run in row.runs if run.status == "complete"]
     errors = [entry for entry in found if entry is not None]
     if not errors or len(errors) < len(found):
         return None
-    ids = errors[0][0]
-    if any(not np.array_equal(other, ids) for other, _ in errors):
+    samples = errors[0][0]
+    if any(not np.array_equal(other, samples) for other, _ in errors):
         return None
-    return ids, np.mean([values for _, values in errors], axis=0)
+    return samples, np.mean([values for _, values in errors], axis=0)

@@ -80,9 +80,9 @@ def _summary(table: TableResult) -> str:
     done = sum(row.status == "complete" for row in table.rows)
     badges = [(f"{done} of {len(table.rows)} rows", "good" if done == len(table.rows) else "bad")]
     if any(table.has_thesis):
-        holds, said = verdict(table.comparisons)
+        holds, said = verdict(table.comparisons, sum(table.num_claims))
         style = "" if holds is None else "good" if holds else "bad"
-        badges.append((f"ordering {said if holds is not None else 'not judged'}", style))
+        badges.append((f"ordering {said if table.comparisons else 'not judged'}", style))
     listed = "".join(f'<span class="badge {style}">{escape(said)}</span>' for said, style in badges)
     return f'<li><a href="#{escape(table.table.name)}">{escape(table.table.title)}</a>{listed}</li>'
 

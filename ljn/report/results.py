@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from ljn.report.ordering import Comparison, Contender, compare
+from ljn.report.ordering import Comparison, Contender, compare, count_claims
 from ljn.report.runs import Run, Sweep, read_sweep, varying
 from ljn.report.tables import APVE, MPJPE, PCKH, TABLES, Axis, Column, Row, Table
 
@@ -91,11 +91,13 @@ class TableResult:
         table: What was asked for.
         rows: Its rows.
         comparisons: Between its rows: those that the thesis's numbers claim, or else the best row and the others.
+        num_claims: Of each column, how many pairs of rows the thesis puts in an order, with results or without.
     """
 
     table: Table
     rows: tuple[RowResult, ...]
     comparisons: tuple[Comparison, ...]
+    num_claims: tuple[int, ...]
 
     @property
     def has_thesis(self) -> tuple[bool, ...]:
@@ -195,7 +197,8 @@ def _fill(table: Table, runs: Sequence[Run]) -> TableResult:
         ]
         for number in range(len(table.columns))
     ]
-    return TableResult(table, rows, compare(table.columns, contenders))
+    num_claims = tuple(map(count_claims, table.columns, contenders))
+    return TableResult(table, rows, compare(table.columns, contenders), num_claims)
 
 
 def _fill_row(row: Row, table: Table, runs: Sequence[Run]) -> list[RowResult]:

@@ -117,14 +117,18 @@ class Run:
             metric: Of which metric.
 
         Returns:
-            Sample ids `(S,)` and errors `(S,)`, mm; None where there are none, or none of that metric.
+            The samples `(S, 73)`, each its number and its true joints (metres, camera frame), by which samples of
+            two runs can be told to be the same, and their errors `(S,)`, mm; None where there are none, or none of
+            that metric.
         """
         if self.directory is None:
             return None
         try:
             with np.load(self.directory / "test_errors.npz") as arrays:
                 errors = _errors(arrays, metric)
-                return None if errors is None else (arrays["sample_id"], errors)
+                ids, joints = arrays["sample_id"], arrays["joints"]
+                samples = np.column_stack([ids, joints.reshape(len(ids), -1)])
+                return None if errors is None else (samples, errors)
         except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
             return None
 

@@ -75,12 +75,12 @@ def describe_order(table: TableResult) -> str:
     if not any(table.has_thesis):
         return ""
     if not table.comparisons:
-        return f"The thesis's ordering: {verdict([])[1]}."
+        return f"The thesis's ordering: {verdict([], sum(table.num_claims))[1]}."
     parts = []
-    for column in table.table.columns:
+    for column, num_claims in zip(table.table.columns, table.num_claims):
         if column.goal is not None:
             own = [comparison for comparison in table.comparisons if comparison.column is column]
-            parts.append(f"{column.label} {verdict(own)[1]}")
+            parts.append(f"{column.label} {verdict(own, num_claims)[1]}")
     return "The thesis's ordering: " + "; ".join(parts) + "."
 
 

@@ -32,7 +32,8 @@ class FakeSweep:
         if errors is not None:
             # Eq. 3.8 leaves the root out.
             joint_errors = np.repeat(np.asarray(errors)[:, None], 24, 1) * 24 / 23
-            np.savez(folder / "test_errors.npz", sample_id=np.arange(len(errors)), errors_mm=joint_errors)
+            samples = {"sample_id": np.arange(len(errors)), "joints": np.zeros((len(errors), 24, 3))}
+            np.savez(folder / "test_errors.npz", **samples, errors_mm=joint_errors)
         self.job(experiment, seed, overrides, run_dir=str(folder))
         return folder
 
