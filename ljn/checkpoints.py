@@ -177,8 +177,13 @@ def _has_interpolation(value: Any) -> bool:
     return isinstance(value, str) and "${" in value
 
 
-def load_state(module: torch.nn.Module, checkpoint: Checkpoint) -> None:
+def load_state(module: torch.nn.Module, checkpoint: Checkpoint, argument: str = "ckpt_path") -> None:
     """Load a checkpoint's weights into the module that its configuration describes.
+
+    Args:
+        module: The module.
+        checkpoint: The checkpoint.
+        argument: The argument to name in errors.
 
     Raises:
         ValueError: The weights belong to another model.
@@ -191,7 +196,7 @@ def load_state(module: torch.nn.Module, checkpoint: Checkpoint) -> None:
         )
         name = differing[0]
         raise ValueError(
-            f"ckpt_path: '{checkpoint.path}' holds the weights of another model: {len(differing)} tensors differ, "
+            f"{argument}: '{checkpoint.path}' holds the weights of another model: {len(differing)} tensors differ, "
             f"the first is '{name}', expected {expected.get(name, 'none')}, got {got.get(name, 'none')}"
         )
     module.load_state_dict(checkpoint.state)
@@ -216,5 +221,5 @@ def load_module(path: str | Path, kind: type[StageModule], name: str = "ckpt_pat
             f"{name}: expected the checkpoint of a {kind.__name__}, but '{path}' is that of a "
             f"{type(module).__name__} ({checkpoint.run}); have two checkpoints changed places?"
         )
-    load_state(module, checkpoint)
+    load_state(module, checkpoint, name)
     return module.eval().requires_grad_(False), checkpoint

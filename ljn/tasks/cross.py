@@ -1,13 +1,16 @@
 """`task=cross`: a trained model on data that it was not trained for; rows of the thesis's tables."""
 
 from pathlib import Path
+from typing import Any
 
 from hydra import compose
 from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig, open_dict
+from omegaconf import DictConfig, OmegaConf, open_dict
 
-from ljn.tasks.evaluate import evaluate_checkpoint
+from ljn.building import build
+from ljn.tasks.evaluate import apply_overrides, evaluate_checkpoint
 from ljn.tasks.train import train
+from ljn.tasks.validation import validate
 
 # Of what was typed, what means the detector, too; of a sweep, the sizes that it sets.
 _SHARED = (
@@ -37,6 +40,12 @@ def cross(cfg: DictConfig) -> dict[str, float]:
             "experiment=mesh/chain"
         )
     overrides = list(task.overrides)
+    # Before the training, which knows nothing of them.
+    plain: dict[str, Any] = OmegaConf.to_container(cfg, resolve=True)  # type: ignore[assignment]
+    changed = OmegaConf.create(plain)
+    apply_overrides(changed, overrides)
+    validate(changed)
+    build(changed.data)
     if task.detector is not None:
         detector = _trained(_composed(task.detector), task.detector)
         overrides += ["data.initial_joints=detector", f"data.detector_ckpt='{detector}'"]

@@ -60,8 +60,12 @@ def evaluate(cfg: DictConfig) -> dict[str, float]:
     """
     if cfg.ckpt_path is None:
         raise ValueError("ckpt_path: expected the checkpoint to evaluate, got null; add ckpt_path=FILE")
-    overrides = list(HydraConfig.get().overrides.task) if HydraConfig.initialized() else []
-    return evaluate_checkpoint(cfg, cfg.ckpt_path, overrides)
+    return evaluate_checkpoint(cfg, cfg.ckpt_path, typed_overrides())
+
+
+def typed_overrides() -> list[str]:
+    """What was typed after `run.py`; nothing in a process that Hydra did not start."""
+    return list(HydraConfig.get().overrides.task) if HydraConfig.initialized() else []
 
 
 def evaluate_checkpoint(
@@ -87,10 +91,16 @@ def evaluate_checkpoint(
     identity_hash = records.config_hash(identity)
     run_dir = set_run_directory(cfg, "evaluations", identity_hash)
     call.paths.run_dir = str(run_dir)
-    if reuses and not call.rerun and records.is_complete(run_dir, identity_hash):
-        _LOG.info("%s is complete; evaluate it again with rerun=true", run_dir)
-        return records.read_json(run_dir / "metrics.json") or {}
+    with records.alone_in(run_dir):
+        if reuses and not call.rerun and records.is_complete(run_dir, identity_hash):
+            _LOG.info("%s is complete; evaluate it again with rerun=true", run_dir)
+            return records.read_json(run_dir / "metrics.json") or {}
+        return _evaluate(cfg, datamodule, checkpoint, run_dir, identity_hash)
 
+
+def _evaluate(
+    cfg: DictConfig, datamodule: BodyDataModule, checkpoint: Checkpoint, run_dir: Path, identity_hash: str
+) -> dict[str, float]:
     prepare_process(cfg)
     module = build(cfg.module)
     load_state(module, checkpoint)
@@ -148,6 +158,20 @@ def with_checkpoint_config(cfg: DictConfig, checkpoint: Checkpoint, overrides: l
     plain |= {name: {**plain[name], **values} for name, values in of_machine.items()}
     merged = OmegaConf.create(plain)
     OmegaConf.set_struct(merged, True)
+    apply_overrides(merged, overrides)
+    return merged
+
+
+def apply_overrides(cfg: DictConfig, overrides: list[str]) -> None:
+    """Change single values of data, trainer and body in a resolved configuration.
+
+    Args:
+        cfg: What a checkpoint's configuration is part of.
+        overrides: As they would be typed; those about what the checkpoint has no say in are left out.
+
+    Raises:
+        ValueError: An override is about something that the checkpoint decides, or names no value.
+    """
     for override in OverridesParser.create().parse_overrides(overrides):
         key = override.key_or_group.replace("/", ".")
         group = key.split(".")[0]
@@ -160,8 +184,7 @@ def with_checkpoint_config(cfg: DictConfig, checkpoint: Checkpoint, overrides: l
                 f"change single values of {', '.join(_OVERRIDABLE)} (data.keypoint_noise_px=15) and choose "
                 "callbacks, logger and paths"
             )
-        _set(merged, key, override.value(), override.input_line)
-    return merged
+        _set(cfg, key, override.value(), override.input_line)
 
 
 def _set(cfg: DictConfig, key: str, value: Any, line: str | None) -> None:

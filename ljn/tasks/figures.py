@@ -16,7 +16,7 @@ from ljn.drawing import MeshSample, Sample, draw_meshes, draw_samples
 from ljn.metrics import mpjpe
 from ljn.modules.joint_detector import JointDetector
 from ljn.modules.mesh_regressor import MeshRegressor
-from ljn.tasks.evaluate import check_bodies, with_checkpoint_config
+from ljn.tasks.evaluate import check_bodies, typed_overrides, with_checkpoint_config
 from ljn.tasks.records import write_json
 from ljn.tasks.train import prepare_process
 from ljn.tasks.validation import check_writable, validate
@@ -48,7 +48,8 @@ def figures(cfg: DictConfig) -> dict[str, float]:
     the test set, not chosen by hand; `figures.json` names them, with their errors and the checkpoints.
 
     Args:
-        cfg: The composed configuration; of it `task`, `paths` and `num_threads` count. `task.detectors` and
+        cfg: The composed configuration; of it `task`, `paths` and `num_threads` count, and of what was typed, what
+            changes the checkpoints' data, as with `task=evaluate`. `task.detectors` and
             `task.regressors` are lists of checkpoints; `task.keypoint_noise_px` gives the noise of each detector's
             keypoints (null: that of its training); `task.num_samples` says how many samples to draw.
 
@@ -107,7 +108,7 @@ def figures(cfg: DictConfig) -> dict[str, float]:
 def _column(cfg: DictConfig, path: str, kind: type, key: str, overrides: Sequence[str]) -> Column:
     """A checkpoint and the test samples as it gets them."""
     module, checkpoint = load_module(path, kind, key)
-    own = with_checkpoint_config(cfg, checkpoint, list(overrides))
+    own = with_checkpoint_config(cfg, checkpoint, [*typed_overrides(), *overrides])
     validate(own)
     prepare_process(own)
     datamodule: BodyDataModule = build(own.data)

@@ -27,3 +27,18 @@ def test_a_run_is_trained_once_and_tested_on_other_data(smoke_config, tmp_path):
 def test_it_has_to_be_said_what_is_trained(smoke_config, tmp_path):
     with pytest.raises(ValueError, match=r"task\.trains: expected the experiment"):
         cross(smoke_config(tmp_path, "task=cross"))
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("data.keypoint_noise=5", "has no key 'data.keypoint_noise'"),
+        ("model.edm=false", "come from the checkpoint"),
+        ("data.keypoint_noise_px=-1", "keypoint_noise_px: expected a number of 0 or more"),
+    ],
+)
+def test_a_mistake_in_the_changes_is_an_error_before_the_training(smoke_config, tmp_path, override, message):
+    cfg = smoke_config(tmp_path, "experiment=detector/cross_0px", f"task.overrides=['{override}']")
+    with pytest.raises(ValueError, match=message):
+        cross(cfg)
+    assert not (tmp_path / "runs").exists()
