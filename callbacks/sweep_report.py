@@ -30,6 +30,7 @@ class SweepReport(Callback):
 
     def __init__(self, output_dir: str | Path) -> None:
         self.output_dir = Path(output_dir)
+        self._sweep: DictConfig | None = None
 
     def on_job_end(self, config: DictConfig, job_return: JobReturn, **kwargs: Any) -> None:
         """Note what became of a job; write the tables of all so far."""
@@ -52,29 +53,29 @@ class SweepReport(Callback):
         notes.mkdir(parents=True, exist_ok=True)
         write_json(notes / f"{int(config.hydra.job.num):04d}.json", note)
         write_report(self._gather(config), is_final=False)
+        self._see_to_the_end()
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
-        """See to it that the sweep is summed up however it ends: after a failed job, Hydra says nothing of its end."""
+        """See to it that the sweep is summed up however it ends."""
         self._sweep = config
-        atexit.register(self._sum_up)
+        self._see_to_the_end()
+
+    def _see_to_the_end(self) -> None:
+        """After a failed job, Hydra says nothing of the sweep's end."""
+        if self._sweep is not None:  # in the process that runs the sweep
+            # Again after every job: what is registered last is called first, while the tracker still works.
+            atexit.unregister(self._sum_up)
+            atexit.register(self._sum_up)
 
     def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
-        """Sum the sweep up, also in the tracker."""
+        """Sum the sweep up."""
         atexit.unregister(self._sum_up)
-        directory = self._sum_up()
-        if directory is None:
+        self._sum_up()
+
+    def _sum_up(self) -> None:
+        """Write and print the tables of all jobs, and the page; log the table to the tracker."""
+        if self._sweep is None or not self._notes(self._sweep).is_dir():  # not one job came to its end
             return
-        # Not above: Hydra imports this file for every call, also for one that should not load PyTorch.
-        from ljn.tasks.tracking import log_table
-
-        with (directory / "table.csv").open(newline="", encoding="utf-8") as file:
-            rows = [{name: _as_number(value) for name, value in row.items()} for row in csv.DictReader(file)]
-        log_table(directory.name, rows, config.logger, directory)
-
-    def _sum_up(self) -> Path | None:
-        """Write and print the tables of all jobs, and the page; returns their directory."""
-        if not self._notes(self._sweep).is_dir():  # not one job came to its end
-            return None
         directory = self._gather(self._sweep)
         report = write_report(directory)
         jobs = (read_json(directory / "sweep.json") or {})["jobs"]
@@ -84,7 +85,12 @@ class SweepReport(Callback):
             f"\n{report.text}\n\n{len(jobs)} jobs: {num_runs} runs, {len(directories) - num_runs} evaluations"
         )
         print("\n".join(map(str, report.paths)), flush=True)
-        return directory
+        # Not above: Hydra imports this file for every call, also for one that should not load PyTorch.
+        from ljn.tasks.tracking import log_table
+
+        with (directory / "table.csv").open(newline="", encoding="utf-8") as file:
+            rows = [{name: _as_number(value) for name, value in row.items()} for row in csv.DictReader(file)]
+        log_table(directory.name, rows, self._sweep.logger, directory)
 
     def _notes(self, config: DictConfig) -> Path:
         return Path(config.hydra.sweep.dir) / "jobs"

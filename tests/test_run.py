@@ -75,14 +75,7 @@ def test_the_demo_sweep_runs_every_row_and_sums_up(tmp_path):
 
 def test_a_failing_job_costs_the_others_nothing_and_is_printed_as_failed(tmp_path):
     done = python(
-        *(
-            "run.py",
-            "sweep=demo",
-            "preset=smoke",
-            f"paths.output_dir={tmp_path}",
-            "data.num_workers=0",
-            "logger=csv",
-        ),
+        *("run.py", "sweep=demo", "preset=smoke", f"paths.output_dir={tmp_path}", "data.num_workers=0"),
         *("preset.num_train=32", "preset.num_val=8", "preset.num_test=16", "preset.max_epochs=1"),
         *("experiment=detector/mean_offset,detector/proposed,detector/basic", "preset.group_size=0"),
         env=os.environ | {"OMP_NUM_THREADS": "1"},
@@ -92,5 +85,6 @@ def test_a_failing_job_costs_the_others_nothing_and_is_printed_as_failed(tmp_pat
     assert [job["status"] for job in jobs] == ["complete", "failed", "complete"]
     assert "group_size: expected" in jobs[1]["error"]
     assert re.search(r"proposed.*failed", done.stdout, re.IGNORECASE)
+    assert len(list(tmp_path.glob("sweeps/demo/wandb/offline-run-*/run-*.wandb"))) == 1, done.stderr
     for job in jobs[::2]:
         assert json.loads((tmp_path / job["run_dir"] / "metrics.json").read_text())["test/mpjpe"] > 0
