@@ -13,8 +13,9 @@ import sys
 import hydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 
+from callbacks.sweep_report import sweep_name
 from ljn.tasks.processes import is_first_process
 from ljn.tasks.schema import register
 
@@ -26,6 +27,8 @@ def main(cfg: DictConfig) -> float | None:
     """Run the task that `cfg.task` names; returns the metric that `cfg.optimized_metric` names."""
     if not is_first_process():
         logging.disable(logging.INFO)  # the first process says it for all
+    if cfg.group is None and HydraConfig.get().mode == RunMode.MULTIRUN:
+        cfg.group = sweep_name(OmegaConf.create({"hydra": HydraConfig.get()}))
     try:
         metrics = hydra.utils.get_method(cfg.task._target_)(cfg)
     except (ValueError, FileNotFoundError, ImportError, FloatingPointError) as error:

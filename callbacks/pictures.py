@@ -60,7 +60,7 @@ class Pictures(Callback):
         self._test: list[dict[str, Tensor]] = []
 
     @abstractmethod
-    def keep(self, outputs: dict[str, Tensor], batch: Batch) -> dict[str, Tensor]:
+    def keep(self, outputs: dict[str, Tensor], batch: Batch, module: Any) -> dict[str, Tensor]:
         """What a picture needs of a batch beside its points, small, and `error` `(B,)`, mm."""
 
     @abstractmethod
@@ -68,6 +68,10 @@ class Pictures(Callback):
         self, samples: dict[str, Tensor], titles: Sequence[str], num_columns: int, module: Any
     ) -> "Figure":
         """A page of samples: the rows of what was kept, and their `points` `(S, N, 3)`; all on the CPU."""
+
+    def unit(self, module: Any) -> str:
+        """What follows an error in a title."""
+        return "mm"
 
     @_never_stops
     def on_validation_batch_end(
@@ -85,7 +89,7 @@ class Pictures(Callback):
         if not is_wanted or missing <= 0:
             return
         ids = {"sample_id": batch["sample_id"], "points": batch["points"][..., :3]}
-        kept = self.keep(outputs, batch) | ids
+        kept = self.keep(outputs, batch, pl_module) | ids
         self._validation.append({name: value[:missing].detach().cpu() for name, value in kept.items()})
 
     @_never_stops
@@ -95,7 +99,7 @@ class Pictures(Callback):
         if kept:
             samples = _join(kept)
             titles = [
-                f"sample {int(number)}: {float(error):.0f} mm"
+                f"sample {int(number)}: {float(error):.0f} {self.unit(pl_module)}"
                 for number, error in zip(samples["sample_id"], samples["error"])
             ]
             figure = self.draw(samples, titles, self.num_samples, pl_module)
@@ -112,7 +116,7 @@ class Pictures(Callback):
         dataloader_idx: int = 0,
     ) -> None:
         """Keep something of every sample."""
-        kept = self.keep(outputs, batch) | {"sample_id": batch["sample_id"]}
+        kept = self.keep(outputs, batch, pl_module) | {"sample_id": batch["sample_id"]}
         self._test.append({name: value.detach().cpu() for name, value in kept.items()})
 
     @_never_stops
@@ -132,7 +136,7 @@ class Pictures(Callback):
         read: Any = trainer.test_dataloaders
         drawn["points"] = read.dataset.__getitems__(drawn["sample_id"].tolist())["points"][..., :3]
         titles = [
-            f"{kind}: {float(samples['error'][index]):.0f} mm"
+            f"{kind}: {float(samples['error'][index]):.0f} {self.unit(pl_module)}"
             for kind, indices in kinds.items()
             for index in indices
         ]
@@ -153,12 +157,21 @@ class Pictures(Callback):
 
 
 class JointPictures(Pictures):
-    """Clouds with true (blue) and predicted (red) skeletons, from the front and from the side; see `Pictures`."""
+    """Clouds with true (blue) and predicted (red) skeletons, from the front and from the side; see `Pictures`.
 
-    def keep(self, outputs: dict[str, Tensor], batch: Batch) -> dict[str, Tensor]:
+    Joints that only mean something beside the root are moved to the true root first.
+    """
+
+    def keep(self, outputs: dict[str, Tensor], batch: Batch, module: Any) -> dict[str, Tensor]:
         """See `Pictures.keep`."""
         pred_joints, joints = outputs["pred_joints"], batch["joints"]
+        if module.net.is_root_relative:
+            pred_joints = pred_joints + (joints - pred_joints)[:, ROOT, None]
         return {"error": mpjpe(pred_joints, joints), "pred_joints": pred_joints, "joints": joints}
+
+    def unit(self, module: Any) -> str:
+        """See `Pictures.unit`."""
+        return "mm, root-aligned" if module.net.is_root_relative else "mm"
 
     def draw(
         self, samples: dict[str, Tensor], titles: Sequence[str], num_columns: int, module: Any
@@ -171,7 +184,7 @@ class JointPictures(Pictures):
 class MeshPictures(Pictures):
     """Predicted (red) beside true (blue) meshes with the cloud over them, front and side; see `Pictures`."""
 
-    def keep(self, outputs: dict[str, Tensor], batch: Batch) -> dict[str, Tensor]:
+    def keep(self, outputs: dict[str, Tensor], batch: Batch, module: Any) -> dict[str, Tensor]:
         """See `Pictures.keep`: parameters and roots, from which the meshes are made again."""
         return {
             "error": outputs["apve"],

@@ -14,6 +14,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig
 
 from ljn.report import write_report
+from ljn.report.runs import settings
 from ljn.tasks.records import read_json, write_json
 
 
@@ -57,7 +58,8 @@ class SweepReport(Callback):
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
         """See to it that the sweep is summed up however it ends."""
-        self._sweep = config
+        self._sweep = config.copy()
+        self._sweep.group = config.group or sweep_name(config)
         self._see_to_the_end()
 
     def _see_to_the_end(self) -> None:
@@ -70,7 +72,13 @@ class SweepReport(Callback):
     def on_multirun_end(self, config: DictConfig, **kwargs: Any) -> None:
         """Sum the sweep up."""
         atexit.unregister(self._sum_up)
-        self._sum_up()
+        try:
+            self._sum_up()
+        except Exception as error:
+            # Hydra would make a warning of it, and the call would have gone well.
+            raise SystemExit(
+                f"error: the runs are there, but not their tables: {type(error).__name__}: {error}"
+            ) from error
 
     def _sum_up(self) -> None:
         """Write and print the tables of all jobs, and the page; log the table to the tracker."""
@@ -97,17 +105,18 @@ class SweepReport(Callback):
 
     def _gather(self, config: DictConfig) -> Path:
         """Write `sweep.json` from the jobs' notes; returns its directory."""
-        chosen = config.hydra.runtime.choices.get("sweep")
-        preset = config.preset.name
-        # A grid of the user's own has no name but the time of its start.
-        name = chosen or f"grid-{Path(config.hydra.sweep.dir).name}"
+        name, preset = sweep_name(config), config.preset.name
         directory = self.output_dir / "sweeps" / (name if name == preset else f"{name}-{preset}")
         directory.mkdir(parents=True, exist_ok=True)
         jobs = [note for path in sorted(self._notes(config).glob("*.json")) if (note := read_json(path))]
-        # What earlier calls have done stays in the tables: other seeds, and what this call has not reached.
+        # What earlier calls have done stays in the tables: other seeds, and what this call has not reached; what
+        # failed, among this call's rows.
         earlier = (read_json(directory / "sweep.json") or {}).get("jobs", [])
-        known = {_key(job) for job in jobs}
-        jobs += [job for job in earlier if job["status"] == "complete" and _key(job) not in known]
+        rows, known = {_row(job, preset) for job in jobs}, {(_row(job, preset), job["seed"]) for job in jobs}
+        for job in earlier:
+            row = _row(job, preset)
+            if (row, job["seed"]) not in known and (job["status"] == "complete" or row in rows):
+                jobs.append(job)
         content = {
             "name": name,
             "preset": preset,
@@ -123,9 +132,18 @@ class SweepReport(Callback):
         return None if run_dir is None else os.path.relpath(run_dir, self.output_dir)
 
 
-def _key(job: dict[str, Any]) -> tuple[Any, ...]:
-    """What makes two jobs the same one: a run's directory is named by all that its numbers depend on."""
-    return job["experiment"], job["run_dir"]
+def sweep_name(config: DictConfig) -> str:
+    """What a multirun is called: a grid of the user's own has no name but the time of its start.
+
+    Args:
+        config: With Hydra's own node.
+    """
+    return config.hydra.runtime.choices.get("sweep") or f"grid-{Path(config.hydra.sweep.dir).name}"
+
+
+def _row(job: dict[str, Any], preset: str) -> tuple[Any, ...]:
+    """What two jobs share that differ in their seeds alone."""
+    return job["experiment"], settings(job["overrides"], preset)
 
 
 def _as_number(value: str) -> float | str:

@@ -178,6 +178,7 @@ class SyntheticDepthDataModule(BodyDataModule):
             "fingerprint": self.fingerprint,
             "licence": self.source.licence,
             "sizes": {split: self.sizes[split] for split in splits},
+            "motion": {split: dict(self.source.motion(split)) for split in splits},
             "pool": {split: self._records_of(split).hash for split in splits},
             "bodies": {body.gender: body.hash for body in self.bodies},
             "detector": None

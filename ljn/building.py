@@ -1,4 +1,4 @@
-"""From configuration to objects, and from nothing but an allow-list of modules.
+"""From configuration to objects, and to nothing but an allow-list of classes.
 
 A `_target_` names code, and a configuration may come out of a checkpoint from anywhere.
 """
@@ -10,19 +10,21 @@ from typing import Any
 import hydra
 from omegaconf import DictConfig, OmegaConf
 
-ALLOWED_MODULES = (
-    "ljn.",
-    "datamodules.",
-    "callbacks.",
-    "lightning.pytorch.",
-    "torch.optim.",
-)
+OWN_MODULES = ("ljn.nets.", "ljn.modules.", "ljn.geometry.camera.", "datamodules.", "callbacks.")
+"""Whose classes a config may name."""
+_FOREIGN_BASES = {
+    "lightning.pytorch.": ("Trainer", "Callback", "loggers.Logger"),
+    "torch.optim.": ("Optimizer", "lr_scheduler.LRScheduler"),
+}
+"""Of other modules, the classes that a config may name, with what they inherit."""
+_ALLOWED = (*OWN_MODULES, *_FOREIGN_BASES)
 
 
 def check_targets(config: Any, where: str = "") -> None:
     """Raise a `ValueError` if any `_target_` in a plain config names something outside the allow-list.
 
-    What a name leads to counts, not the name alone: `ljn.x.os.system` is no way out.
+    What a name leads to counts, not the name alone: `ljn.nets.layers.math.os` is no way out, and a function that
+    calls whatever it is given, such as Lightning's `instantiate_class`, is none either.
     """
     if isinstance(config, Mapping):
         if "_target_" in config:
@@ -35,22 +37,32 @@ def check_targets(config: Any, where: str = "") -> None:
 
 
 def _check_target(target: str, where: str) -> None:
-    allowed = ", ".join(ALLOWED_MODULES)
-    if not target.startswith(ALLOWED_MODULES):
+    allowed = ", ".join(_ALLOWED)
+    if not target.startswith(_ALLOWED):
         raise ValueError(
             f"{where}: `_target_: {target}` is outside the modules that a config may name: {allowed}"
         )
-    module, _, name = target.rpartition(".")
     try:
-        found = getattr(import_module(module), name)
+        found = _find(target)
     except (ImportError, AttributeError) as error:
         raise ValueError(f"{where}: `_target_: {target}` cannot be found ({error})") from error
     home = f"{getattr(found, '__module__', None)}."
-    if not callable(found) or not home.startswith(ALLOWED_MODULES):
+    if not isinstance(found, type) or not home.startswith(_ALLOWED):
         raise ValueError(
-            f"{where}: `_target_: {target}` leads to {home.rstrip('.')}, outside the modules that a config may "
-            f"name: {allowed}"
+            f"{where}: `_target_: {target}` leads to {type(found).__name__} of {home.rstrip('.')}; a config may name "
+            f"classes of {allowed}"
         )
+    for prefix, bases in _FOREIGN_BASES.items():
+        if home.startswith(prefix) and not issubclass(found, tuple(_find(prefix + base) for base in bases)):
+            raise ValueError(
+                f"{where}: `_target_: {target}` is none of the classes that a config may name of "
+                f"{prefix.rstrip('.')}: those that inherit {' or '.join(bases)}"
+            )
+
+
+def _find(path: str) -> Any:
+    module, _, name = path.rpartition(".")
+    return getattr(import_module(module), name)
 
 
 def build(config: DictConfig | Mapping[str, Any], **arguments: Any) -> Any:

@@ -79,7 +79,7 @@ class BodyDataModule(LightningDataModule):
 
     @abstractmethod
     def describe(self, splits: Sequence[str] = SPLITS) -> dict[str, Any]:
-        """Source, bodies, sizes, the hash of each split's poses and the like: goes into records.
+        """Source, bodies, sizes, each split's motion capture, the hash of its poses and the like: goes into records.
 
         Args:
             splits: The splits that the run reads.

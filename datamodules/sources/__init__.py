@@ -1,7 +1,7 @@
 """Sources of poses. Each yields `PoseRecords` for a split; how they are rendered is not its concern."""
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Protocol
@@ -97,6 +97,10 @@ class PoseSource(Protocol):
 
     def check(self) -> None:
         """Raise `FileNotFoundError` or `ValueError` where its files are missing or damaged."""
+        ...
+
+    def motion(self, split: str) -> Mapping[str, int]:
+        """How much motion capture a split's poses are made from: `clips`, `frames` and what else is known of it."""
         ...
 
     def records(self, split: str, num_records: int, seed: int) -> PoseRecords:

@@ -132,6 +132,16 @@ class EmbeddedSource:
         """Whatever bodies the poses are worn by, they are made on one."""
         return load_body_model()
 
+    def motion(self, split: str) -> dict[str, int]:
+        """See `PoseSource.motion`: the clips that a frame or a part of a pose can come from."""
+        if not any(share for kind, share in self.settings.shares.items() if kind != "procedural"):
+            return {"clips": 0, "frames": 0}
+        return {"clips": len(self._split[split]), "frames": int(self._is_donor(split).sum())}
+
+    def _is_donor(self, split: str) -> np.ndarray:
+        """Whether each frame belongs to a split."""
+        return np.isin(self._clips.clip, self._split[split])
+
     def mixture(self, split: str) -> PoseMixture:
         """The mixture of a split (one of `SPLITS`), whose donors are that split's clips."""
         if split not in SPLITS:
@@ -139,7 +149,7 @@ class EmbeddedSource:
         if not self._split[split]:
             raise ValueError(f"split: {self.split_path} lists no clips for '{split}'")
         if split not in self._mixtures:
-            is_donor = np.isin(self._clips.clip, self._split[split])
+            is_donor = self._is_donor(split)
             rotvec = torch.from_numpy(self._clips.poses[is_donor]).double().unflatten(-1, (NUM_JOINTS, 3))
             rotmat = with_square_elbows(rotvec_to_rotmat(rotvec))
             donors = clip_donors(rotmat, self._clips.clip[is_donor])

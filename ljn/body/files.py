@@ -6,10 +6,8 @@ either package and without running anything.
 
 import hashlib
 import io
-import pickle
 import re
 import zipfile
-import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,6 +18,7 @@ from numpy.typing import NDArray
 
 from ljn.body.skeleton import NUM_JOINTS, PARENTS
 from ljn.body.unpickling import ForbiddenContentError, read_pickled_arrays
+from ljn.reading import READ_ERRORS
 
 GENDERS: dict[str, int] = {"female": 0, "male": 1, "neutral": 2}
 """Gender codes: SURREAL's 0 and 1, and neutral."""
@@ -149,7 +148,7 @@ def load_body_model(path: str | Path | None = None, gender: str = "neutral") -> 
         arrays = _READERS[path.suffix.lower()](path.read_bytes())
     except ForbiddenContentError as error:
         raise ValueError(f"{path}: {error} {_NOT_SMPL}") from error
-    except _READ_ERRORS as error:
+    except READ_ERRORS as error:
         raise ValueError(
             f"{path}: cannot be read ({error}): damaged, or no SMPL model. Fetch it again."
         ) from error
@@ -255,8 +254,3 @@ _FILE_NAMES = {
     for gender, official in (("female", "f"), ("male", "m"), ("neutral", "neutral"))
 }
 _READERS: dict[str, Callable[[bytes], Mapping[str, Any]]] = {".npz": _read_npz, ".pkl": _read_pkl}
-_READ_ERRORS = (
-    ArithmeticError, AttributeError, EOFError, LookupError, MemoryError, OSError, RuntimeError, TypeError,
-    ValueError, pickle.UnpicklingError, zipfile.BadZipFile, zlib.error,
-)  # fmt: skip
-"""What a damaged file makes numpy, zipfile and pickle raise."""

@@ -40,7 +40,7 @@ def ball_group(points: np.ndarray, centres: np.ndarray, squared_radii: np.ndarra
         points: `(B, N, 3)`.
         centres: `(B, M, 3)`.
         squared_radii: `(M,)`.
-        index: `(B, M, n)`; underfull balls repeat their points in turn.
+        index: `(B, M, n)`, n at least 1, which is not checked; underfull balls repeat their points in turn.
     """
     group_size = index.shape[2]
     for b in range(points.shape[0]):

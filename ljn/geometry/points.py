@@ -60,11 +60,20 @@ def ball_group(points: Tensor, centres: Tensor, radii: Tensor, group_size: int) 
         points: `(B, N, 3)`, metres, N at least 1.
         centres: `(B, M, 3)`, metres.
         radii: `(M,)`, metres.
-        group_size: Number of points in each group; may exceed N, then points repeat.
+        group_size: Number of points in each group, at least 1; may exceed N, then points repeat.
 
     Returns:
         `(B, M, group_size)`, int64 indices into the N points.
+
+    Raises:
+        ValueError: `group_size` is less than 1, or there is not one radius for each centre.
     """
+    if group_size < 1:
+        raise ValueError(f"group_size: expected at least 1, got {group_size}")
+    if radii.shape != centres.shape[1:2]:
+        raise ValueError(
+            f"radii: expected one for each of {centres.shape[1]} centres, got {tuple(radii.shape)}"
+        )
     form = _ball_group_on_cpu if points.is_cpu else _ball_group_as_tensors
     return form(points, centres, radii, group_size)
 

@@ -50,7 +50,7 @@ class SampleMax(Metric):
     """
 
     is_differentiable = False
-    higher_is_better = False
+    higher_is_better: bool | None = False
     full_state_update = False
     formula: ClassVar[Callable[..., Tensor]]
     maximum: Tensor
@@ -117,12 +117,14 @@ class PCKhThreshold(SampleMean):
 class MeanKeypointDistance(SampleMean):
     """Mean distance of the noisy 2D keypoints from the clean, px; see `functional.keypoint_distances_px`."""
 
+    higher_is_better = None
     formula = staticmethod(functional.keypoint_distances_px)
 
 
 class MaxKeypointDistance(SampleMax):
     """Maximum distance of a noisy 2D keypoint from the clean, px; see `functional.keypoint_distances_px`."""
 
+    higher_is_better = None
     formula = staticmethod(functional.keypoint_distances_px)
 
 

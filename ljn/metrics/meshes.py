@@ -30,12 +30,14 @@ class ProcrustesAPVE(SampleMean):
 class MeanJointDistance(SampleMean):
     """Mean distance of the initial joints from the true ones, mm; see `functional.joint_errors_mm`."""
 
+    higher_is_better = None
     formula = staticmethod(functional.joint_errors_mm)
 
 
 class MaxJointDistance(SampleMax):
     """Maximum distance of an initial joint from the true one, mm; see `functional.joint_errors_mm`."""
 
+    higher_is_better = None
     formula = staticmethod(functional.joint_errors_mm)
 
 

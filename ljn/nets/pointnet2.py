@@ -19,6 +19,9 @@ class SetAbstraction(nn.Module):
         in_channels: Channels of a point beside its position.
         channels: Widths of the shared perceptron.
         relative_to_radius: Whether positions in a ball are in units of its radius, or in metres.
+
+    Raises:
+        ValueError: `num_centres` or `group_size` is less than 1.
     """
 
     def __init__(
@@ -31,6 +34,9 @@ class SetAbstraction(nn.Module):
         relative_to_radius: bool = True,
     ) -> None:
         super().__init__()
+        for name, value in (("num_centres", num_centres), ("group_size", group_size)):
+            if value < 1:
+                raise ValueError(f"{name}: expected at least 1, got {value}")
         self.num_centres = num_centres
         self.group_size = group_size
         self.unit_m = radius_m if relative_to_radius else 1.0
@@ -79,7 +85,7 @@ class PointNet2(nn.Module):
         relative_to_radius: See `SetAbstraction`.
 
     Raises:
-        ValueError: The lists differ in length.
+        ValueError: The lists differ in length, or a number of centres or points is less than 1.
     """
 
     def __init__(

@@ -2,13 +2,32 @@
 
 import math
 import statistics
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 from ljn.report.ordering import Comparison, Contender, compare, count_claims
 from ljn.report.runs import Run, Sweep, read_sweep, varying
-from ljn.report.tables import APVE, MPJPE, PCKH, TABLES, Axis, Column, Row, Table
+from ljn.report.tables import (
+    APVE,
+    MPJPE,
+    PCKH,
+    ROOT_ALIGNED,
+    ROOT_ALIGNED_NOTE,
+    TABLES,
+    Axis,
+    Column,
+    Row,
+    Table,
+)
+
+_STAGES = {"detector": ("joint detectors", (MPJPE, PCKH)), "mesh": ("mesh regressors", (APVE, MPJPE))}
+"""What a stage's models are called, and its metrics, by the folder of its experiments."""
+_ROOT_RELATIVE = {
+    row.experiment for table in TABLES.values() for row in table.rows if row.metrics is ROOT_ALIGNED
+}
 
 
 @dataclass(frozen=True)
@@ -33,8 +52,8 @@ class Cell:
 
     @property
     def is_substituted(self) -> bool:
-        """Whether another metric than the column's is shown beside the thesis's."""
-        return self.metric != self.column.metric and self.thesis is not None
+        """Whether it is of joints whose roots were moved to the same place, unlike the column's metric."""
+        return self.metric != self.column.metric and self.metric in ROOT_ALIGNED.values()
 
     @property
     def difference(self) -> float | None:
@@ -150,21 +169,66 @@ def read_results(directory: Path) -> Results:
     others = [run for run in sweep.runs if run.experiment not in wanted or run.experiment is None]
     if others or not tables:
         title = f"Other runs of {sweep.name}" if tables else sweep.name
-        tables.append(grid(sweep.name if not tables else "other_runs", title, others))
+        tables += grids(sweep.name if not tables else "other_runs", title, others)
     return Results(sweep, tuple(_fill(table, sweep.runs) for table in tables))
 
 
-def grid(name: str, title: str, runs: Sequence[Run]) -> Table:
-    """A table of any runs: a row for each setting, with the metrics that there are.
+def grids(name: str, title: str, runs: Sequence[Run]) -> list[Table]:
+    """Tables of any runs: a row for each setting, with the metrics that there are.
+
+    Joint detectors and mesh regressors have a table each: their errors are in different frames.
 
     Args:
         name: The table's name.
         title: Its title.
-        runs: What it shows.
+        runs: What is shown.
     """
+    settings: dict[Any, list[Run]] = {}
+    for run in runs:
+        settings.setdefault((run.experiment, run.overrides), []).append(run)
+    stages = {setting: _stage(group) for setting, group in settings.items()}
+    found = [stage for stage in _STAGES if stage in stages.values()] or ["detector"]
+    tables = []
+    for stage in found:
+        # What left nothing to tell its stage by goes into the first table.
+        own = [run for run in runs if (stages[run.experiment, run.overrides] or found[0]) == stage]
+        kind, columns = _STAGES[stage]
+        names = (name, title) if len(found) == 1 else (f"{name}_{stage}", f"{title}: {kind}")
+        tables.append(_grid(*names, columns, own))
+    return tables
+
+
+def _stage(runs: Sequence[Run]) -> str | None:
+    """The stage of a setting's runs: what their metrics say, or else their experiment's folder."""
+    known = {metric for run in runs for metric in run.metrics}
+    if known:
+        return "mesh" if "apve" in known else "detector"
+    folder = (runs[0].experiment or "").partition("/")[0]
+    return folder if folder in _STAGES else None
+
+
+def _is_root_relative(run: Run) -> bool:
+    """Whether its detector's joints only mean something beside the root."""
+    if not run.metrics.keys() & ROOT_ALIGNED.values():
+        return False
+    if run.experiment in _ROOT_RELATIVE:
+        return True
+    model = run.config.get("model")
+    module, _, name = str(model.get("_target_") if isinstance(model, Mapping) else None).rpartition(".")
+    if not module.startswith("ljn.nets."):
+        return False
+    try:
+        return getattr(getattr(import_module(module), name, None), "is_root_relative", False) is True
+    except ImportError:
+        return False
+
+
+def _grid(name: str, title: str, columns: tuple[Column, ...], runs: Sequence[Run]) -> Table:
+    """The table of one stage's runs."""
     changing = varying(run.overrides for run in runs)
     has_experiments = len({run.experiment for run in runs}) > 1
     settings = list(dict.fromkeys((run.experiment, run.overrides) for run in runs))
+    root_relative = {(run.experiment, run.overrides) for run in runs if _is_root_relative(run)}
     keys = {override.partition("=")[0] for override in changing}
     axis = None
     if len(keys) == 1 and not has_experiments and all(_number(override) is not None for override in changing):
@@ -174,11 +238,12 @@ def grid(name: str, title: str, runs: Sequence[Run]) -> Table:
         shown = [override for override in overrides if override in changing]
         parts = ([experiment] if experiment and (has_experiments or not shown) else []) + shown
         x = _number(shown[0]) if axis and shown else None
-        rows.append(Row(", ".join(parts) or name, experiment, x=x, overrides=overrides))
+        metrics = ROOT_ALIGNED if (experiment, overrides) in root_relative else {}
+        rows.append(Row(", ".join(parts) or name, experiment, x=x, metrics=metrics, overrides=overrides))
     known = {metric for run in runs for metric in run.metrics}
-    columns = (APVE, MPJPE) if "apve" in known else (MPJPE, PCKH)
-    present = tuple(column for column in columns if column.metric in known) or (MPJPE,)
-    return Table(name, title, present, tuple(rows), axis=axis)
+    present = tuple(column for column in columns if column.metric in known) or columns[:1]
+    notes = (ROOT_ALIGNED_NOTE,) if root_relative else ()
+    return Table(name, title, present, tuple(rows), axis=axis, notes=notes)
 
 
 def _number(override: str) -> float | None:

@@ -3,7 +3,6 @@
 import csv
 import json
 import math
-import zipfile
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -13,10 +12,35 @@ from typing import Any, Literal
 import numpy as np
 import yaml
 
+from ljn.reading import READ_ERRORS
+
 Status = Literal["complete", "failed", "missing"]
 
-# Overrides that say nothing about what a run is: what a row is called, and what it is averaged over.
-_NOT_A_SETTING = ("experiment", "seed", "sweep")
+# Overrides that say nothing about what a run is: what a row is called, what it is averaged over, and what is the
+# machine's or the tracker's.
+_NOT_A_SETTING = (
+    "experiment", "seed", "sweep", "tables", "name", "group", "tags", "rerun", "num_threads", "local", "hydra",
+    "paths", "logger", "callbacks.pictures", "callbacks.progress", "callbacks.errors", "data.cache_dir",
+    "data.num_workers", "data.prefetch_batches", "trainer.accelerator", "trainer.devices", "trainer.strategy",
+    "trainer.enable_model_summary", "trainer.log_every_n_steps", "trainer.profiler",
+)  # fmt: skip
+
+
+def settings(overrides: Iterable[str], preset: str) -> tuple[str, ...]:
+    """Those of a job's typed overrides that say what its run is, sorted.
+
+    Args:
+        overrides: As they were typed.
+        preset: The sweep's preset, which says nothing new.
+    """
+    kept = []
+    for override in overrides:
+        key, _, value = override.partition("=")
+        key = key.lstrip("+~").replace("/", ".")
+        is_setting = not any(key == name or key.startswith(f"{name}.") for name in _NOT_A_SETTING)
+        if is_setting and (key, value) != ("preset", preset):
+            kept.append(override)
+    return tuple(sorted(kept))
 
 
 @dataclass(frozen=True)
@@ -25,7 +49,7 @@ class Run:
 
     Attributes:
         experiment: Such as `detector/basic`; None in a free grid.
-        overrides: Its task overrides but for experiment and seed, sorted.
+        overrides: Of its task overrides, `settings`.
         seed: Its seed.
         directory: The run's directory; None for a job that never had one.
         status: `missing`: it is not said to have failed, but has no result.
@@ -63,7 +87,8 @@ class Run:
         return path if path is not None and path.is_file() else None
 
     @cached_property
-    def _config(self) -> Mapping[str, Any]:
+    def config(self) -> Mapping[str, Any]:
+        """Its resolved configuration, or nothing."""
         try:
             assert self.directory is not None
             return _mapping(yaml.safe_load((self.directory / "config.yaml").read_text()))
@@ -72,7 +97,7 @@ class Run:
 
     def setting(self, key: str) -> float | None:
         """A number of its configuration, such as `data.num_points`; None where there is none."""
-        value: Any = self._config
+        value: Any = self.config
         for part in key.split("."):
             value = _mapping(value).get(part)
         return float(value) if isinstance(value, int | float) else None
@@ -129,7 +154,7 @@ class Run:
                 ids, joints = arrays["sample_id"], arrays["joints"]
                 samples = np.column_stack([ids, joints.reshape(len(ids), -1)])
                 return None if errors is None else (samples, errors)
-        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+        except READ_ERRORS:
             return None
 
 
@@ -142,7 +167,7 @@ class Sweep:
         preset: The sizes, such as `small`.
         tables: Names of the tables that it fills.
         command: What started it.
-        runs: In the order of the jobs; a job that is there again, with the same run, counts once.
+        runs: In the order of the jobs; of jobs of the same experiment, settings and seed, the first.
     """
 
     name: str
@@ -172,20 +197,21 @@ def read_sweep(directory: Path) -> Sweep:
         raise ValueError(
             f"'{path}': expected a JSON object with a list of jobs, got a damaged file; run the sweep again"
         )
+    preset = str(content.get("preset") or "missing")
     runs: dict[Any, Run] = {}
-    for number, job in enumerate(content["jobs"]):
-        run = _read_run(_mapping(job), directory)
-        runs[run.experiment, run.overrides, run.seed, run.directory or number] = run
+    for job in content["jobs"]:
+        run = _read_run(_mapping(job), directory, preset)
+        runs.setdefault((run.experiment, run.overrides, run.seed), run)
     return Sweep(
         name=str(content.get("name") or directory.name),
-        preset=str(content.get("preset") or "missing"),
+        preset=preset,
         tables=tuple(str(name) for name in content.get("tables") or ()),
         command=str(content.get("command") or "missing"),
         runs=tuple(runs.values()),
     )
 
 
-def _read_run(job: Mapping[str, Any], sweep: Path) -> Run:
+def _read_run(job: Mapping[str, Any], sweep: Path, preset: str) -> Run:
     directory = _locate(job.get("run_dir"), sweep)
     record = _read_json(directory / "record.json") if directory else None
     metrics = _test_metrics(_read_json(directory / "metrics.json") if directory else None)
@@ -198,7 +224,7 @@ def _read_run(job: Mapping[str, Any], sweep: Path) -> Run:
     overrides = (str(override) for override in job.get("overrides") or ())
     return Run(
         experiment=None if job.get("experiment") is None else str(job["experiment"]),
-        overrides=tuple(sorted(item for item in overrides if item.partition("=")[0] not in _NOT_A_SETTING)),
+        overrides=settings(overrides, preset),
         seed=job["seed"] if isinstance(job.get("seed"), int) else None,
         directory=directory,
         status=status,

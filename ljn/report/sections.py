@@ -12,9 +12,17 @@ from PIL import Image
 
 from ljn.report.results import Results
 from ljn.report.runs import Run
+from ljn.report.tables import NUM_DATA
+from ljn.report.writers import NONE
 
 _MAX_PICTURE_PX = 1600
 _MISSING = '<span class="word">missing</span>'
+_SPLITS = {"train": "train", "val": "validation", "test": "test"}
+_COUNTS_NOTE = (
+    "Thesis: Table 3.1, SURREAL and the samples taken of it; its validation set is a part of its test set. Ours: the "
+    "motion capture that poses are taken and recombined from, where it is known (procedural poses need none); each "
+    "sample is a pose and a shape of the split's pool."
+)
 
 
 def text(value: Any) -> str:
@@ -33,35 +41,59 @@ def scroll(table: str, label: str) -> str:
 
 
 def data(runs: Sequence[Run]) -> str:
-    """Table 3.1's counts for our data: each split's size and pool; once for runs of equal data."""
-    groups: dict[str, tuple[Mapping[str, Any], list[Run]]] = {}
+    """Table 3.1 beside our data's counts, and each split's pool; once for runs of equal data."""
+    groups: dict[str, list[Run]] = {}
     for run in runs:
         if run.data:
-            same = {key: run.data.get(key) for key in ("source", "version", "sizes", "pool", "licence")}
-            groups.setdefault(repr(same), (same, []))[1].append(run)
+            same = [run.data.get(key) for key in ("source", "version", "sizes", "pool", "licence", "bodies")]
+            groups.setdefault(repr(same), []).append(run)
     if not groups:
         return f"<p>{_MISSING}: no run left a record of its data.</p>"
     parts = []
-    for facts, group in groups.values():
-        sizes, pool = _dict(facts["sizes"]), _dict(facts["pool"])
-        rows = "".join(
-            f'<tr><th scope="row">{escape(name)}</th><td>{_count(sizes.get(split))}</td>'
-            f'<td class="text">{mono(pool.get(split))}</td></tr>'
-            for split, name in (("train", "train"), ("val", "validation"), ("test", "test"))
-        )
-        caption = f"{len(group)} run{'s' * (len(group) > 1)}"
-        table = (
-            f"<table><caption>{caption}</caption><thead><tr><th></th>"
-            '<th scope="col">samples</th><th scope="col" class="text">hash of the pool of poses</th></tr></thead>'
-            f"<tbody>{rows}</tbody></table>"
-        )
+    for group in groups.values():
+        facts = group[0].data
+        bodies = ", ".join(map(str, _dict(facts.get("bodies"))))
+        listed = {"source": facts.get("source"), "version": facts.get("version"), "bodies": bodies}
         parts.append(
-            f'<dl class="facts"><div><dt>source</dt><dd>{text(facts["source"])}</dd></div>'
-            f"<div><dt>version</dt><dd>{text(facts['version'])}</dd></div></dl>"
-            + scroll(table, "Numbers of samples")
-            + f'<p class="notes">{text(facts["licence"])}</p>'
+            '<dl class="facts">'
+            + "".join(f"<div><dt>{name}</dt><dd>{text(value)}</dd></div>" for name, value in listed.items())
+            + "</dl>"
+            + scroll(_counts(group), "Numbers of data")
+            + f'<p class="notes">{text(facts.get("licence"))}</p>'
         )
-    return "".join(parts)
+    return "".join(parts) + f'<p class="notes">{_COUNTS_NOTE}</p>'
+
+
+def _counts(runs: Sequence[Run]) -> str:
+    """The table of the counts of runs of equal data; older records do not say what the poses are made from."""
+    facts = runs[0].data
+    sizes, pool = _dict(facts.get("sizes")), _dict(facts.get("pool"))
+    motion = next((found for run in runs if (found := _dict(run.data.get("motion")))), {})
+    own = {split: {**_dict(motion.get(split)), "samples": sizes.get(split)} for split in NUM_DATA}
+    groups, columns, cells = ["<th></th>"], ["<th></th>"], dict.fromkeys(NUM_DATA, "")
+    for name in NUM_DATA["train"]:
+        has_own = name == "samples" or any(counts.get(name) is not None for counts in own.values())
+        names = ("thesis", "ours") if has_own else ("thesis",)
+        groups.append(f'<th scope="colgroup" colspan="{len(names)}"><span>{name}</span></th>')
+        columns += [f'<th scope="col">{title}</th>' for title in names]
+        for split, counts in own.items():
+            cells[split] += _cell(NUM_DATA[split].get(name), "thesis")
+            cells[split] += _cell(counts.get(name), "ours") if has_own else ""
+    groups.append("<th></th>")
+    columns.append('<th scope="col" class="text">hash of the pool of poses</th>')
+    rows = "".join(
+        f'<tr><th scope="row">{_SPLITS[split]}</th>{row}'
+        f'<td class="text">{mono(pool[split]) if pool.get(split) else NONE}</td></tr>'
+        for split, row in cells.items()
+    )
+    return (
+        f"<table><caption>{len(runs)} run{'s' * (len(runs) > 1)}</caption>"
+        f"<thead><tr>{''.join(groups)}</tr><tr>{''.join(columns)}</tr></thead><tbody>{rows}</tbody></table>"
+    )
+
+
+def _cell(value: Any, style: str) -> str:
+    return f'<td class="none">{NONE}</td>' if value is None else f'<td class="{style}">{_count(value)}</td>'
 
 
 def pictures(results: Results) -> str:

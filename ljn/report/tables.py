@@ -118,15 +118,16 @@ _EQ38_NOTE = (
     "all joints (test/mpjpe_eq38). The plain mean over all joints is test/mpjpe in metrics.json."
 )
 _DISTANCE_NOTE = "Distances are those of the initial joints from the true ones."
-_ROOT_ALIGNED_NOTE = (
-    "† The simple baseline's joints only mean something beside the root: its rows show both metrics after the roots "
+ROOT_ALIGNED_NOTE = (
+    "† Joints that only mean something beside the root, such as the simple baseline's: MPJPE and PCKh after the roots "
     "were moved to the same place (test/mpjpe_root_aligned, test/pckh_root_aligned)."
 )
-_ROOT_ALIGNED = {
+ROOT_ALIGNED = {
     "mpjpe": "mpjpe_root_aligned",
     "mpjpe_eq38": "mpjpe_root_aligned",
     "pckh": "pckh_root_aligned",
 }
+"""What rows of detectors show whose joints only mean something beside the root."""
 _NO_PCKH = {"mpjpe": "initial_mpjpe", "pckh": None}
 
 _NOISE_2D = Axis("σ of the 2D joints' noise, px", "data.keypoint_noise_px")
@@ -163,19 +164,19 @@ _ALL = (
                 "simple baseline, σ = 0",
                 "detector/simple_baseline_0px",
                 _values(_DETECTOR, 59.4, 51.9),
-                metrics=_ROOT_ALIGNED,
+                metrics=ROOT_ALIGNED,
             ),
             Row(
                 "simple baseline, σ = 10 px",
                 "detector/simple_baseline",
                 _values(_DETECTOR, 81.3, 33.6),
-                metrics=_ROOT_ALIGNED,
+                metrics=ROOT_ALIGNED,
             ),
         ),
         notes=(
             "All but the fourth row have 2D joints with noise of σ = 10 px.",
             _EQ38_NOTE,
-            _ROOT_ALIGNED_NOTE,
+            ROOT_ALIGNED_NOTE,
         ),
     ),
     Table(
@@ -297,3 +298,16 @@ _ALL = (
 
 TABLES: dict[str, Table] = {table.name: table for table in _ALL}
 """The tables by name: the thesis's, their cross evaluations and the demonstration's."""
+
+NUM_DATA: Mapping[str, Mapping[str, int]] = {
+    "train": {
+        "subjects": 115,
+        "sequences": 1_964,
+        "clips": 55_001,
+        "frames": 5_342_090,
+        "samples": 60_000,
+    },
+    "val": {"samples": 5_000},
+    "test": {"subjects": 30, "sequences": 703, "clips": 12_528, "frames": 1_194_662, "samples": 15_000},
+}
+"""Table 3.1: how much there is of SURREAL, and of the thesis's samples of it, by split."""

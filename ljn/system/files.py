@@ -1,7 +1,7 @@
 """Reading what a user has: depth images, masks, cameras and keypoints."""
 
 import json
-import zipfile
+import math
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +9,7 @@ import numpy as np
 import yaml
 
 from ljn.geometry.camera import Camera
+from ljn.reading import READ_ERRORS
 
 DEPTH_SUFFIXES = (".png", ".npy", ".npz")
 _GREY = ("1", "L", "I", "I;16", "I;16B", "F")  # Pillow's modes of one channel
@@ -40,15 +41,17 @@ def read_depth(path: str | Path) -> np.ndarray:
             )
         return image
     try:
-        content = np.load(path, allow_pickle=False)
-        if isinstance(content, np.ndarray):
-            return content
-        with content:
+        with path.open("rb") as file:
+            content = np.load(file, allow_pickle=False)
+            if isinstance(content, np.ndarray):
+                return content
             names = content.files
             if len(names) == 1 or "depth" in names:
-                array: np.ndarray = content["depth" if "depth" in names else names[0]]
+                array = content["depth" if "depth" in names else names[0]]
+                if not isinstance(array, np.ndarray):
+                    raise TypeError("its entry is no array")
                 return array
-    except (OSError, EOFError, ValueError, zipfile.BadZipFile) as error:
+    except READ_ERRORS as error:
         raise _unreadable("depth", path, error) from error
     raise ValueError(f"depth: expected one array or one with the key 'depth' in '{path}', got {names}")
 
@@ -72,12 +75,12 @@ def read_camera(path: str | Path) -> Camera:
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: It cannot be read, or keys are missing or unknown.
+        ValueError: It cannot be read, keys are missing or unknown, or a value is not what its key needs.
     """
     path = _existing(path, "camera")
     try:
         content = yaml.safe_load(path.read_text())
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
+    except (yaml.YAMLError, *READ_ERRORS) as error:
         raise _unreadable("camera", path, error) from error
     if not isinstance(content, dict):
         raise ValueError(f"camera: expected the keys {', '.join(_CAMERA_KEYS)} in '{path}', got {content!r}")
@@ -93,11 +96,13 @@ def read_camera(path: str | Path) -> Camera:
             raise ValueError(
                 f"camera: expected the keys {', '.join(_CAMERA_KEYS)} in '{path}': {', '.join(names)} {problem}"
             )
-    try:
-        fx, fy, cx, cy = (float(values[key]) for key in _CAMERA_KEYS[:4])
-        return Camera(fx, fy, cx, cy, int(values["width"]), int(values["height"]))
-    except TypeError as error:
-        raise ValueError(f"camera: expected numbers in '{path}', got {values}") from error
+    fx, fy, cx, cy, width, height = (_camera_number(values[key], key, path) for key in _CAMERA_KEYS)
+    for key, size in (("width", width), ("height", height)):
+        if not size.is_integer():
+            raise ValueError(
+                f"camera: {key}: expected a whole number of pixels in '{path}', got {size:g}; give the image's own size"
+            )
+    return Camera(fx, fy, cx, cy, int(width), int(height))
 
 
 def read_keypoints(path: str | Path) -> Any:
@@ -110,18 +115,31 @@ def read_keypoints(path: str | Path) -> Any:
     path = _existing(path, "keypoints")
     try:
         return json.loads(path.read_text())
-    except ValueError as error:
+    except READ_ERRORS as error:
         raise _unreadable("keypoints", path, error) from error
+
+
+def _camera_number(value: Any, key: str, path: Path) -> float:
+    try:
+        # YAML takes 3.6e2, which JSON may hold, for text.
+        number = math.nan if isinstance(value, bool) else float(value)
+    except (TypeError, ValueError, OverflowError):
+        number = math.nan
+    if not math.isfinite(number):
+        raise ValueError(
+            f"camera: {key}: expected a finite number in '{path}', got {value!r}; give it in pixels, such as {key}: 366"
+        )
+    return number
 
 
 def _read_png(path: Path, name: str) -> np.ndarray:
     from PIL import Image
 
+    unreadable: tuple[type[Exception], ...] = (Image.DecompressionBombError, *READ_ERRORS)
     try:
         with Image.open(path) as image:
             return np.asarray(image if image.mode in _GREY else image.convert("RGB"))
-    # What Pillow raises where a file is cut off or is no picture.
-    except (OSError, SyntaxError, ValueError) as error:
+    except unreadable as error:
         raise _unreadable(name, path, error) from error
 
 
@@ -133,5 +151,5 @@ def _existing(path: str | Path, name: str) -> Path:
 
 
 def _unreadable(name: str, path: Path, error: Exception) -> ValueError:
-    reason = str(error).strip().split("\n")[0]
+    reason = str(error).strip().split("\n")[0] or type(error).__name__
     return ValueError(f"{name}: '{path}' is damaged, cut off or of another format ({reason}); write it again")

@@ -220,14 +220,7 @@ def _parse(keypoints: Any) -> tuple[str, np.ndarray]:
     if "keypoints" in keypoints:
         return _parse_entries(keypoints["keypoints"], keypoints.get("order"))
     if "people" in keypoints:
-        people = keypoints["people"]
-        if not isinstance(people, Sequence) or len(people) != 1:
-            raise ValueError(
-                f"keypoints: expected one person in OpenPose's file, got {len(people)}; keep the one that the depth "
-                "image shows"
-            )
-        flat = np.asarray(people[0]["pose_keypoints_2d"], np.float64)
-        return _parse_entries(flat.reshape(-1, 3), "body25")
+        return _parse_entries(_only_person(keypoints["people"]), "body25")
     for name, order in ORDERS.items():
         if keypoints and keypoints.keys() <= set(order.names):
             return _parse_entries([keypoints.get(entry) for entry in order.names], name)
@@ -240,12 +233,35 @@ def _parse(keypoints: Any) -> tuple[str, np.ndarray]:
     )
 
 
-def _parse_entries(entries: Any, name: str | None) -> tuple[str, np.ndarray]:
-    if name is not None and name not in ORDERS:
-        raise ValueError(f"keypoints: expected an order of {', '.join(ORDERS)}, got '{name}'")
+def _only_person(people: Any) -> np.ndarray:
+    """`(K, 3)` of OpenPose's `people`."""
+    is_list = isinstance(people, Sequence) and not isinstance(people, str)
+    if not is_list or len(people) != 1:
+        got = len(people) if is_list else repr(people)
+        raise ValueError(
+            f"keypoints: expected one person in OpenPose's file, got {got}; keep the one that the depth image shows"
+        )
+    (person,) = people
+    flat = person.get("pose_keypoints_2d") if isinstance(person, Mapping) else None
+    try:
+        return np.asarray(flat, np.float64).reshape(-1, 3)
+    except (TypeError, ValueError, OverflowError) as error:
+        shown = "none" if flat is None else f"others ({error})"
+        raise ValueError(
+            "keypoints: expected u, v and confidence of each keypoint, one after another, under 'pose_keypoints_2d' of "
+            f"OpenPose's person, got {shown}; have OpenPose write the file again, with its model BODY_25"
+        ) from error
+
+
+def _parse_entries(entries: Any, name: Any) -> tuple[str, np.ndarray]:
+    if name is not None and not (isinstance(name, str) and name in ORDERS):
+        raise ValueError(
+            f"keypoints: expected an order of {', '.join(ORDERS)}, got {name!r}; give one of these names, or leave the "
+            "order out"
+        )
     try:
         table = np.array([_entry(entry) for entry in entries], np.float64).reshape(-1, 3)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise ValueError(
             f"keypoints: expected [u, v] or [u, v, confidence] for each, in pixels, or null ({error})"
         ) from error
@@ -265,6 +281,8 @@ def _entry(entry: Any) -> list[float]:
     """`[u, v, confidence]` of one keypoint."""
     if entry is None:
         return [np.nan, np.nan, 0]
+    if isinstance(entry, str):
+        raise TypeError(f"got the text {entry!r}")
     values = [np.nan if value is None else float(value) for value in entry]
     if len(values) not in (2, 3):
         raise ValueError(f"got {len(values)} numbers: {values}")

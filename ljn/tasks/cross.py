@@ -8,7 +8,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf, open_dict
 
 from ljn.building import build
-from ljn.tasks.evaluate import apply_overrides, evaluate_checkpoint
+from ljn.tasks.evaluate import apply_overrides, evaluate_checkpoint, typed_overrides
 from ljn.tasks.train import train
 from ljn.tasks.validation import validate
 
@@ -39,6 +39,7 @@ def cross(cfg: DictConfig) -> dict[str, float]:
             "task.trains: expected the experiment whose run is tested, got null; choose a row, as in "
             "experiment=mesh/chain"
         )
+    _check_trains(cfg)
     overrides = list(task.overrides)
     # Before the training, which knows nothing of them.
     plain: dict[str, Any] = OmegaConf.to_container(cfg, resolve=True)  # type: ignore[assignment]
@@ -50,6 +51,20 @@ def cross(cfg: DictConfig) -> dict[str, float]:
         detector = _trained(_composed(task.detector), task.detector)
         overrides += ["data.initial_joints=detector", f"data.detector_ckpt='{detector}'"]
     return evaluate_checkpoint(cfg, _trained(cfg.copy(), task.trains), overrides, cfg.name, reuses=True)
+
+
+def _check_trains(cfg: DictConfig) -> None:
+    """Raise a `ValueError` unless the experiment that is said to be trained is configured as this row is."""
+    typed = [line for line in typed_overrides() if not line.startswith(("experiment=", "name=", "task"))]
+    if not typed_overrides():
+        return
+    trained = compose("config", [f"experiment={cfg.task.trains}", *typed])
+    for group in ("model", "module", "data", "trainer"):
+        if trained[group] != cfg[group]:
+            raise ValueError(
+                f"task.trains: '{cfg.task.trains}' has another {group} than this row; choose the row of that "
+                f"experiment, or write one whose defaults begin with it"
+            )
 
 
 def _trained(cfg: DictConfig, name: str) -> Path:

@@ -112,6 +112,7 @@ def _evaluate(
         "trained_by": checkpoint.run,
         "checkpoint": {"path": str(checkpoint.path), "hash": checkpoint.file_hash, "epoch": checkpoint.epoch},
         "data": datamodule.describe(("test",)),
+        "predicted_body": records.predicted_body(cfg),
     }
     with records.RunRecord(run_dir, facts) as record:
         config = save_config(cfg, run_dir)

@@ -21,7 +21,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, OmegaConf, open_dict
 
 from ljn.tasks.processes import is_first_process
 
@@ -32,6 +32,7 @@ _LOG = logging.getLogger(__name__)
 _NOT_IDENTITY: dict[str, tuple[str, ...]] = {
     "data": ("source", "cache_dir", "num_workers", "prefetch_batches", "body_path", "detector_ckpt"),
     "module": ("body_path",),
+    "callbacks": ("progress", "errors", "pictures"),
     "trainer": (
         "accelerator",
         "devices",
@@ -50,17 +51,30 @@ def identity(cfg: DictConfig, data_fingerprint: str) -> dict[str, Any]:
         cfg: The composed configuration.
         data_fingerprint: See `BodyDataModule.fingerprint`.
     """
+    cfg = cfg.copy()
+    with open_dict(cfg):
+        cfg.paths.run_dir = ""  # named by what comes of this
     plain: dict[str, Any] = OmegaConf.to_container(cfg, resolve=True)  # type: ignore[assignment]
-    # The metric chooses the best epoch.
-    kept: dict[str, Any] = {
-        "seed": plain["seed"],
-        "optimized_metric": plain["optimized_metric"],
-        "data_fingerprint": data_fingerprint,
-    }
-    for group in ("data", "model", "module", "trainer"):
+    kept: dict[str, Any] = {"seed": plain["seed"], "data_fingerprint": data_fingerprint}
+    kept |= {"predicted_body": predicted_body(cfg)}
+    # Callbacks: what chooses the best epoch, or ends a training.
+    for group in ("data", "model", "module", "trainer", "callbacks"):
         dropped = _NOT_IDENTITY.get(group, ())
-        kept[group] = {key: value for key, value in plain[group].items() if key not in dropped}
+        content = plain[group] or {}
+        kept[group] = {
+            key: value for key, value in content.items() if key not in dropped and value is not None
+        }
     return kept
+
+
+def predicted_body(cfg: DictConfig) -> str | None:
+    """Hash of the body that a mesh regressor's meshes are of; None for a detector."""
+    if "predicted" not in cfg.module:
+        return None
+    from ljn.body import load_body_models  # and with it PyTorch, which a sweep's report does not need
+
+    [body] = load_body_models(cfg.module.body_path, [cfg.module.predicted])
+    return body.hash
 
 
 def config_hash(plain: Mapping[str, Any]) -> str:

@@ -1,6 +1,8 @@
 """What types alone cannot say about a configuration, checked before data is read or a model is built."""
 
+import math
 import tempfile
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +12,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from ljn.body.skeleton import JOINT_NAMES, NUM_JOINTS
 from ljn.building import check_targets
+from ljn.report.tables import TABLES
 from ljn.tasks.processes import check_processes
 
 
@@ -24,10 +27,13 @@ def validate(cfg: DictConfig) -> None:
         raise ValueError(
             f"{', '.join(unread)}: only task=predict reads this; add task=predict, or leave it out"
         )
-    check_targets(plain)
+    check_targets({name: value for name, value in plain.items() if name != "task"})
     _check_radii(plain.get("model") or {})
     _check_integers(plain)
+    _check_set_abstractions(plain)
+    _check_learning_rate(plain)
     _check_monitors(plain)
+    _check_tables(plain)
     check_processes(plain)
     for name in ("output_dir", "cache_dir"):
         check_writable(Path(plain["paths"][name]), f"paths.{name}")
@@ -75,6 +81,55 @@ def _check_integers(plain: dict[str, Any]) -> None:
         raise ValueError(f"num_threads: expected 1 or more, or null, got {plain['num_threads']}")
 
 
+def _check_set_abstractions(plain: dict[str, Any]) -> None:
+    trunk = (plain.get("model") or {}).get("trunk")
+    if not isinstance(trunk, dict):
+        return
+    for key in ("num_centres", "group_sizes"):
+        values = trunk.get(key, [1])
+        if not (isinstance(values, list) and values and all(isinstance(n, int) and n >= 1 for n in values)):
+            raise ValueError(
+                f"model.trunk.{key} (preset.mesh.{key}): expected an integer of 1 or more for each set abstraction, "
+                f"got {values!r}"
+            )
+    if "num_centres" not in trunk:
+        return
+    centres, name = trunk["num_centres"], "model.trunk.num_centres (preset.mesh.num_centres)"
+    if sorted(centres, reverse=True) != centres:
+        raise ValueError(
+            f"{name}: expected no number greater than the one before, got {centres}: each set abstraction takes its "
+            f"centres from those before; set preset.mesh.num_centres={_as_override(sorted(centres, reverse=True))}"
+        )
+    num_points = (plain.get("data") or {}).get("num_points")
+    if num_points is not None and centres[0] > num_points:
+        fitting = _as_override(min(number, num_points) for number in centres)
+        raise ValueError(
+            f"{name}: expected at most data.num_points={num_points} centres, since they are taken from the cloud's "
+            f"points, got {centres}; set data.num_points={centres[0]} or more, or preset.mesh.num_centres={fitting}"
+        )
+
+
+def _as_override(values: Iterable[int]) -> str:
+    return f"[{','.join(map(str, values))}]"
+
+
+def _check_learning_rate(plain: dict[str, Any]) -> None:
+    optimizer = (plain.get("module") or {}).get("optimizer") or {}
+    if "lr" not in optimizer:
+        return
+    rate = optimizer["lr"]
+    is_number = isinstance(rate, int | float) and not isinstance(rate, bool)
+    if not (is_number and 0 < rate < math.inf):
+        raise ValueError(
+            f"module.optimizer.lr: expected a positive finite number, got {rate!r}; set preset.learning_rate=1e-3"
+        )
+
+
+def _check_tables(plain: dict[str, Any]) -> None:
+    if unknown := [name for name in plain["tables"] if name not in TABLES]:
+        raise ValueError(f"tables: expected some of {', '.join(TABLES)}, got {', '.join(unknown)}")
+
+
 def _check_monitors(plain: dict[str, Any]) -> None:
     # The module says what it logs; its target has passed `check_targets`.
     module: Any = get_class(plain["module"]["_target_"])
@@ -89,4 +144,19 @@ def _check_monitors(plain: dict[str, Any]) -> None:
         if metric is not None and metric not in choices:
             raise ValueError(
                 f"{name}: no metric '{metric}' is logged; choose one of {', '.join(sorted(choices))}"
+            )
+    is_better_higher = {f"val/{key}": metric.higher_is_better for key, metric in module.metrics().items()}
+    for name, node in (plain.get("callbacks") or {}).items():
+        if not node or node.get("monitor") is None or "mode" not in node:
+            continue
+        metric, mode = node["monitor"], node["mode"]
+        wanted = {True: "max", False: "min", None: None}[is_better_higher.get(metric, False)]
+        if wanted is None:
+            raise ValueError(
+                f"callbacks.{name}.monitor: '{metric}' describes the data, and no model makes it better; choose "
+                f"another of {', '.join(sorted(key for key, value in is_better_higher.items() if value is not None))}"
+            )
+        if mode != wanted:
+            raise ValueError(
+                f"callbacks.{name}.mode: '{mode}' would keep the worst '{metric}'; add callbacks.{name}.mode={wanted}"
             )

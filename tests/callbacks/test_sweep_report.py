@@ -12,10 +12,10 @@ from callbacks.sweep_report import SweepReport
 def end_job(tmp_path):
     """Let a job of a call end; returns the jobs that `sweep.json` then names."""
 
-    def end(call, number, run_dir, status=JobStatus.COMPLETED):
+    def end(call, number, run_dir, status=JobStatus.COMPLETED, typed=()):
         hydra = {
             "mode": RunMode.MULTIRUN,
-            "overrides": {"task": [f"seed={number}"]},
+            "overrides": {"task": [f"seed={number}", *typed]},
             "runtime": {"choices": {"experiment": "detector/proposed", "sweep": "table_3_4"}},
             "sweep": {"dir": str(tmp_path / "multirun" / call)},
             "job": {"num": number},
@@ -33,15 +33,30 @@ def end_job(tmp_path):
 def test_a_later_call_keeps_what_earlier_ones_have_done(end_job):
     end_job("first", 0, "a")
     end_job("first", 1, "b")
-    jobs = end_job("second", 0, "a")
-    assert sorted(job["run_dir"] for job in jobs) == ["runs/a", "runs/b"]
-    jobs = end_job("third", 0, "c")
+    jobs = end_job("second", 2, "c")
     assert sorted(job["run_dir"] for job in jobs) == ["runs/a", "runs/b", "runs/c"]
 
 
-def test_failures_of_earlier_calls_are_forgotten_and_those_of_this_one_count(end_job):
+def test_a_seed_that_ran_again_takes_the_place_of_the_earlier_run(end_job):
+    end_job("first", 0, "a")
+    end_job("first", 1, "b")
+    jobs = end_job("second", 0, "with-another-hash", typed=("num_threads=1", "paths.output_dir=elsewhere"))
+    assert sorted(job["run_dir"] for job in jobs) == ["runs/b", "runs/with-another-hash"]
+    jobs = end_job("third", 0, "c", typed=("data.num_points=64",))
+    assert len(jobs) == 3, "another row"
+
+
+def test_a_failure_is_kept_among_the_rows_of_a_later_call_until_it_is_mended(end_job):
     end_job("first", 0, "a", JobStatus.FAILED)
-    jobs = end_job("second", 1, "b")
-    assert [job["run_dir"] for job in jobs] == ["runs/b"]
-    [job] = end_job("third", 1, "b", JobStatus.FAILED)
+    end_job("first", 1, "b")
+    jobs = end_job("second", 2, "c")
+    assert [(job["seed"], job["status"]) for job in jobs] == [(2, "complete"), (0, "failed"), (1, "complete")]
+    jobs = end_job("third", 0, "a")
+    assert {job["status"] for job in jobs} == {"complete"}
+    [job, *_] = end_job("fourth", 1, "b", JobStatus.FAILED)
     assert (job["status"], job["error"]) == ("failed", "ValueError: broken")
+
+
+def test_a_failure_with_other_settings_is_forgotten(end_job):
+    end_job("first", 0, "a", JobStatus.FAILED, typed=("data.num_points=0",))
+    assert len(end_job("second", 0, "b", typed=("data.num_points=64",))) == 1

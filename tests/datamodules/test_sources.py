@@ -186,6 +186,13 @@ def test_the_embedded_split_uses_every_clip_and_every_stratum_in_each_split(sour
     assert {clip for split in SPLITS for clip in source._split[split]} == set(source._clips.clip.tolist())
 
 
+def test_the_motion_of_the_splits_is_that_of_all_clips(source):
+    motion = {split: source.motion(split) for split in SPLITS}
+    assert [motion[split]["clips"] for split in SPLITS] == [13, 4, 5]
+    assert sum(counts["frames"] for counts in motion.values()) == len(source._clips.clip) == 3625
+    assert EmbeddedSource(shares={"procedural": 1, "whole": 0}).motion("train") == {"clips": 0, "frames": 0}
+
+
 def test_the_same_seed_gives_the_same_records_and_another_seed_others(source):
     first, again, other = (EmbeddedSource().records("train", 150, seed) for seed in (3, 3, 4))
     for name in ("pose", "betas", "gender", "sequence", "frame"):

@@ -10,6 +10,7 @@ from lightning.fabric.utilities.data import _set_sampler_epoch
 
 from datamodules.batches import EpochSampler
 from datamodules.placement import place
+from datamodules.sources import SPLITS
 from datamodules.sources.embedded import EmbeddedSource
 from datamodules.synthesis import concatenate
 from ljn.body import SMPL
@@ -112,6 +113,12 @@ def test_the_test_set_is_another_than_the_validation_set(make_datamodule):
     assert (
         val["noisy_keypoints_2d"] - val["keypoints_2d"] != test["noisy_keypoints_2d"] - test["keypoints_2d"]
     ).any()
+
+
+def test_what_goes_into_records_has_the_motion_capture_of_each_split_that_is_read(make_datamodule, source):
+    datamodule = make_datamodule(num_train=2, num_val=2, num_test=2)
+    assert datamodule.describe()["motion"] == {split: source.motion(split) for split in SPLITS}
+    assert datamodule.describe(("test",))["motion"] == {"test": {"clips": 5, "frames": 1238}}
 
 
 def test_the_key_of_a_fixed_set_follows_everything_that_it_depends_on(make_datamodule):

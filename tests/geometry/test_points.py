@@ -151,6 +151,17 @@ def test_a_point_on_the_surface_of_the_ball_belongs_to_it():
     assert group_on_line(2.0, 1.0, 3) == [1, 2, 3]
 
 
+@pytest.mark.parametrize("group_size", [0, -1])
+def test_a_group_of_no_points_is_refused(group_size):
+    with pytest.raises(ValueError, match=f"group_size: expected at least 1, got {group_size}"):
+        group_on_line(2.0, 1.0, group_size)
+
+
+def test_every_centre_needs_a_radius():
+    with pytest.raises(ValueError, match=r"radii: expected one for each of 2 centres, got \(3,\)"):
+        ball_group(torch.zeros(1, 4, 3), torch.zeros(1, 2, 3), torch.ones(3), 4)
+
+
 def test_a_cloud_of_one_point_fills_every_group():
     index = ball_group(torch.zeros(1, 1, 3), torch.tensor([[[0.0, 0, 0], [9, 9, 9]]]), torch.ones(2), 4)
     assert index.tolist() == [[[0] * 4, [0] * 4]]

@@ -80,6 +80,18 @@ def test_lists_of_different_lengths_are_refused():
         PointNet2(**{**SIZES, "radii_m": (0.3,)})
 
 
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"group_sizes": (0, 4)}, "group_size: expected at least 1, got 0"),
+        ({"num_centres": (16, 0)}, "num_centres: expected at least 1, got 0"),
+    ],
+)
+def test_groups_without_points_and_no_centres_are_refused(changes, message):
+    with pytest.raises(ValueError, match=message):
+        PointNet2(**{**SIZES, **changes})
+
+
 def test_a_cloud_with_fewer_points_than_centres_is_refused(make):
     with pytest.raises(ValueError, match="num_samples: expected 1 to 8, the number of points, got 16"):
         make()(cloud(num_points=8))

@@ -67,6 +67,11 @@ RECORD = {
         "fingerprint": "feed5eed",
         "licence": "CC0",
         "sizes": {"train": 12000, "val": 500, "test": 2000},
+        "motion": {
+            "train": {"clips": 13, "frames": 2129},
+            "val": {"clips": 4, "frames": 258},
+            "test": {"clips": 5, "frames": 1238},
+        },
         "pool": {"train": "aaaa1111", "val": "bbbb2222", "test": "cccc3333"},
         "bodies": {"female": "dddd4444", "male": "eeee5555"},
         "detector": {"path": "outputs/runs/detector/checkpoints/best.ckpt", "hash": "d37ec70rd37ec70r"},

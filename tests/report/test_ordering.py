@@ -99,7 +99,7 @@ def test_runs_with_the_errors_of_the_same_samples_get_an_interval(sweep):
 
 
 @pytest.mark.parametrize(
-    "damage", ["fewer samples", "other samples", "no file", "no zip file", "another metric"]
+    "damage", ["fewer samples", "other samples", "no file", "no zip file", "a wrong byte", "another metric"]
 )
 def test_without_the_errors_of_the_same_samples_there_is_no_interval(sweep, damage):
     errors = np.random.default_rng(1).uniform(20, 90, 30)
@@ -112,6 +112,12 @@ def test_without_the_errors_of_the_same_samples_there_is_no_interval(sweep, dama
         path.unlink()
     elif damage == "no zip file":
         path.write_bytes(b"PK\x03\x04 cut off")
+    elif damage == "a wrong byte":
+        with np.load(path) as arrays:
+            np.savez_compressed(path, **dict(arrays))
+        content = bytearray(path.read_bytes())
+        content[90:100] = b"\xff" * 10  # in the first array's deflated data
+        path.write_bytes(content)
     elif damage == "other samples":
         with np.load(path) as arrays:
             np.savez(path, **dict(arrays) | {"joints": arrays["joints"] + 0.1})

@@ -117,6 +117,59 @@ def test_every_run_s_origin_is_there(html):
         assert text in html
 
 
+def counts(html):
+    """The headings of the table of the data's counts with their columns, and its rows."""
+    table = re.search(r'aria-label="Numbers of data".*?</table>', html, re.DOTALL)[0]
+    lines = [re.findall(r"<t[hd]([^>]*)>(?:<span[^>]*>)?([^<]*)", line) for line in table.split("<tr>")[1:]]
+    spans = {text: int(re.search('colspan="(.)"', tag)[1]) for tag, text in lines[0] if text}
+    return spans, [[text for _, text in line] for line in lines[2:]]
+
+
+def test_the_data_s_counts_stand_beside_those_of_table_3_1(html):
+    spans, rows = counts(html)
+    assert spans == {"subjects": 1, "sequences": 1, "clips": 2, "frames": 2, "samples": 2}
+    assert rows == [
+        ["train", "115", "1,964", "55,001", "13", "5,342,090", "2,129", "60,000", "12,000", "aaaa1111"],
+        ["validation", "–", "–", "–", "4", "–", "258", "5,000", "500", "bbbb2222"],
+        ["test", "30", "703", "12,528", "5", "1,194,662", "1,238", "15,000", "2,000", "cccc3333"],
+    ]
+    assert "<dt>bodies</dt><dd>female, male</dd>" in html
+
+
+def data_of(folder, **changes):
+    path = folder / "record.json"
+    record = json.loads(path.read_text())
+    record["data"] |= changes
+    path.write_text(json.dumps(record))
+
+
+def test_counts_that_records_lack_are_left_out(sweep):
+    data_of(sweep.run("detector/basic", {"mpjpe_eq38": 60.0}), motion=None)
+    write_report(sweep.write("table_3_2"))
+    spans, rows = counts((sweep.directory / "report.html").read_text())
+    assert spans == {"subjects": 1, "sequences": 1, "clips": 1, "frames": 1, "samples": 2}
+    assert rows[0] == ["train", "115", "1,964", "55,001", "5,342,090", "60,000", "12,000", "aaaa1111"]
+
+
+def test_an_older_record_of_the_same_data_shares_the_counts_of_a_newer_one(sweep):
+    data_of(sweep.run("detector/basic", {"mpjpe_eq38": 60.0}), motion=None)
+    sweep.run("detector/proposed", {"mpjpe_eq38": 50.0})
+    write_report(sweep.write("table_3_2"))
+    html = (sweep.directory / "report.html").read_text()
+    assert counts(html)[0]["clips"] == 2
+    assert "<caption>2 runs</caption>" in html
+
+
+def test_splits_that_an_evaluation_does_not_read_have_dashes_for_its_counts(sweep):
+    changes = {
+        name: {"test": value} for name, value in {"sizes": 7, "pool": "cccc", "motion": {"clips": 5}}.items()
+    }
+    data_of(sweep.run("detector/cross_0px", {"mpjpe_eq38": 60.0}), **changes)
+    write_report(sweep.write("table_3_3_cross"))
+    _, rows = counts((sweep.directory / "report.html").read_text())
+    assert [row[-2:] for row in rows] == [["–", "–"], ["–", "–"], ["7", "cccc"]]
+
+
 def test_an_evaluation_names_the_run_that_it_evaluates(sweep):
     checkpoint = {"path": "best.ckpt", "hash": "beef0001", "epoch": 12}
     changes = {"trained_by": "proposed-small-1", "checkpoint": checkpoint, "num_parameters": None}

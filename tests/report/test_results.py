@@ -7,6 +7,7 @@ import pytest
 
 from ljn.report.results import read_results
 from ljn.report.runs import read_sweep
+from ljn.report.tables import ROOT_ALIGNED_NOTE
 
 
 def cells(directory, table=0):
@@ -106,6 +107,78 @@ def test_a_grid_of_mesh_regressors_shows_apve_first(sweep):
     (table,) = read_results(sweep.write()).tables
     assert [row.label for row in table.rows] == ["mesh/basic", "mesh/proposed"]
     assert [column.metric for column in table.table.columns] == ["apve", "mpjpe"]
+
+
+SIMPLE_BASELINE = {"mpjpe": 900.0, "mpjpe_root_aligned": 80.0, "pckh": 1.0, "pckh_root_aligned": 30.0}
+PROPOSED = {"mpjpe": 60.0, "mpjpe_root_aligned": 55.0, "pckh": 50.0, "pckh_root_aligned": 52.0}
+
+
+def test_a_grid_shows_the_simple_baseline_after_moving_the_roots_as_the_thesis_s_tables_do(sweep):
+    for seed in (0, 1):
+        sweep.run("detector/simple_baseline", SIMPLE_BASELINE, seed)
+        sweep.run("detector/proposed", PROPOSED, seed)
+    (table,) = read_results(sweep.write()).tables
+    assert [[cell.metric for cell in row.cells] for row in table.rows] == [
+        ["mpjpe_root_aligned", "pckh_root_aligned"],
+        ["mpjpe", "pckh"],
+    ]
+    assert [[cell.is_substituted for cell in row.cells] for row in table.rows] == [[True] * 2, [False] * 2]
+    assert table.table.notes == (ROOT_ALIGNED_NOTE,)
+    assert [comparison.lead for comparison in table.comparisons] == [20.0, 20.0]
+
+
+@pytest.mark.parametrize(
+    ("target", "is_substituted"),
+    [
+        ("ljn.nets.simple_baseline.SimpleBaseline", True),
+        ("ljn.nets.joint_network.JointNetwork", False),
+        ("ljn.nets.simple_baseline.NoSuchNetwork", False),
+        ("ljn.nets.no_such_module.Network", False),
+        ("elsewhere.Network", False),
+        (None, False),
+    ],
+)
+def test_a_grid_knows_root_relative_detectors_by_their_networks(sweep, target, is_substituted):
+    folder = sweep.run(None, SIMPLE_BASELINE, overrides=("model=mine",))
+    (folder / "config.yaml").write_text(json.dumps({"model": {"_target_": target}}))
+    (table,) = read_results(sweep.write()).tables
+    assert [cell.is_substituted for cell in table.rows[0].cells] == [is_substituted] * 2
+    assert bool(table.table.notes) == is_substituted
+
+
+def test_a_grid_of_both_stages_has_a_table_for_each(sweep):
+    sweep.run("mesh/basic", {"apve": 50.0, "mpjpe": 40.0})
+    sweep.run("detector/basic", {"mpjpe": 90.0, "pckh": 40.0})
+    sweep.run(None, {"apve": 45.0, "mpjpe": 35.0}, overrides=("model.a=1",))
+    tables = read_results(sweep.write()).tables
+    assert [table.table.name for table in tables] == ["sweep_detector", "sweep_mesh"]
+    assert [table.table.title for table in tables] == ["sweep: joint detectors", "sweep: mesh regressors"]
+    assert [[row.label for row in table.rows] for table in tables] == [
+        ["detector/basic"],
+        ["mesh/basic", "model.a=1"],
+    ]
+    assert [[column.metric for column in table.table.columns] for table in tables] == [
+        ["mpjpe", "pckh"],
+        ["apve", "mpjpe"],
+    ]
+    assert all(cell.mean is not None for table in tables for row in table.rows for cell in row.cells)
+
+
+def test_runs_without_metrics_are_in_the_table_of_their_stage(sweep):
+    sweep.run("mesh/basic", {"apve": 50.0, "mpjpe": 40.0})
+    sweep.run("mine", {"apve": 50.0, "mpjpe": 40.0})
+    for experiment in ("mesh/single", "mine", "detector/basic", None):
+        sweep.job(experiment, seed=1, status="failed")
+    first, second = read_results(sweep.write()).tables
+    assert [(row.row.experiment, row.status) for row in first.rows] == [
+        ("detector/basic", "failed"),
+        (None, "failed"),
+    ]
+    assert [(row.row.experiment, row.status) for row in second.rows] == [
+        ("mesh/basic", "complete"),
+        ("mine", "failed 1 of 2"),
+        ("mesh/single", "failed"),
+    ]
 
 
 def test_runs_that_belong_to_no_table_are_shown_all_the_same(sweep):

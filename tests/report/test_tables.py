@@ -1,6 +1,6 @@
 import pytest
 
-from ljn.report.tables import TABLES
+from ljn.report.tables import NUM_DATA, TABLES
 
 
 def printed(table, *metrics):
@@ -55,6 +55,14 @@ def test_literature_of_table_3_5():
         ("SPIN", 41.1, None),
         ("HKMR", None, 71.0),
     ]
+
+
+def test_the_counts_of_the_data_are_those_of_table_3_1():
+    assert {split: tuple(counts.values()) for split, counts in NUM_DATA.items()} == {
+        "train": (115, 1964, 55001, 5342090, 60000),
+        "val": (5000,),
+        "test": (30, 703, 12528, 1194662, 15000),
+    }
 
 
 def test_only_the_row_that_a_cross_table_shares_has_the_thesis_s_numbers():

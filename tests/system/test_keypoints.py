@@ -86,6 +86,11 @@ def test_a_single_missing_joint_is_filled_in_nearby(joint, truth):
     assert error < 0.1 * np.ptp(truth[:, 1])
 
 
+def people(keypoints):
+    """What OpenPose writes of one person."""
+    return {"people": [{"pose_keypoints_2d": keypoints}]}
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -102,6 +107,21 @@ def test_a_single_missing_joint_is_filled_in_nearby(joint, truth):
         (lambda t: [[1, 2, 3, 4]] * 24, r"expected \[u, v\] or \[u, v, confidence\].*got 4 numbers"),
         (lambda t: ["here"] * 24, r"expected \[u, v\] or \[u, v, confidence\]"),
         (lambda t: 7, r"expected \[u, v\] or \[u, v, confidence\]"),
+        (lambda t: ["12"] * 24, r"expected \[u, v\] or \[u, v, confidence\].*got the text '12'"),
+        (lambda t: [[10**400, 1]] * 24, r"expected \[u, v\] or \[u, v, confidence\]"),
+        (lambda t: {"order": ["smpl24"], "keypoints": t}, r"expected an order of .*got \['smpl24'\]"),
+        (lambda t: {"order": {}, "keypoints": t}, "expected an order of .*got {}"),
+        (lambda t: {"keypoints": None}, r"expected \[u, v\] or \[u, v, confidence\]"),
+        (lambda t: {"people": None}, "expected one person in OpenPose's file, got None; keep the one"),
+        (lambda t: {"people": 3}, "expected one person in OpenPose's file, got 3"),
+        (lambda t: {"people": "a"}, "expected one person in OpenPose's file, got 'a'"),
+        (lambda t: {"people": []}, "expected one person in OpenPose's file, got 0"),
+        (lambda t: {"people": [{}]}, "under 'pose_keypoints_2d' .*got none; have OpenPose write"),
+        (lambda t: {"people": [None]}, "under 'pose_keypoints_2d' .*got none; have OpenPose write"),
+        (lambda t: people([1.0] * 74), "under 'pose_keypoints_2d' .*got others .*BODY_25"),
+        (lambda t: people("here"), "under 'pose_keypoints_2d' .*got others"),
+        (lambda t: people([{}] * 75), "under 'pose_keypoints_2d' .*got others"),
+        (lambda t: people([10**400] * 75), "under 'pose_keypoints_2d' .*got others"),
         (lambda t: t[:3], "of them, got 3; give those that are missing as null"),
         (lambda t: t * 0, f"0 joints are known, expected at least {MIN_KNOWN}"),
     ],

@@ -118,10 +118,42 @@ def test_a_value_of_the_wrong_type_is_rejected(compose_config):
         (["data.batch_size=null"], r"data\.batch_size: expected an integer of 1 or more, got None"),
         (["data.num_workers=-1"], r"data\.num_workers: expected an integer of 0 or more, got -1"),
         (["data.eval_seed=-1"], r"data\.eval_seed: expected an integer of 0 or more, got -1"),
+        (
+            ["experiment=mesh/proposed", "data.num_points=100"],
+            r"preset\.mesh\.num_centres\): expected at most data\.num_points=100 .*got \[128, 32\]; set "
+            r"data\.num_points=128 or more, or preset\.mesh\.num_centres=\[100,32\]",
+        ),
+        (
+            ["experiment=mesh/basic", "preset.mesh.num_centres=[16,32]"],
+            r"preset\.mesh\.num_centres\): expected no number greater than the one before, got \[16, 32\].*"
+            r"set preset\.mesh\.num_centres=\[32,16\]",
+        ),
+        (
+            ["experiment=mesh/proposed", "preset.mesh.num_centres=[16,0]"],
+            r"preset\.mesh\.num_centres\): expected an integer of 1 or more .*got \[16, 0\]",
+        ),
+        (
+            ["experiment=mesh/proposed", "preset.mesh.group_sizes=[0,4]"],
+            r"preset\.mesh\.group_sizes\): expected an integer of 1 or more .*got \[0, 4\]",
+        ),
+        (
+            ["experiment=mesh/proposed", "model.trunk.group_sizes=[2.5,4]"],
+            r"model\.trunk\.group_sizes .*: expected an integer of 1 or more .*got \[2\.5, 4\]",
+        ),
+        *(
+            ([f"preset.learning_rate={rate}"], r"module\.optimizer\.lr: expected a positive finite number")
+            for rate in ("0", "-1e-3", "nan", "inf", "null", "fast", "true")
+        ),
         (["num_threads=-2"], r"num_threads: expected 1 or more, or null, got -2"),
         (["paths.cache_dir=/dev/null/x"], r"paths\.cache_dir: cannot write in '/dev/null/x'"),
         (["input=depth.png"], r"input: only task=predict reads this; add task=predict"),
         (["callbacks.best.monitor=val/mjpe"], r"callbacks\.best\.monitor: no metric 'val/mjpe'.*val/mpjpe"),
+        (["optimized_metric=val/pckh"], r"callbacks\.best\.mode: 'min' would keep the worst.*mode=max"),
+        (
+            ["optimized_metric=val/initial_mean_distance_px"],
+            r"callbacks\.best\.monitor: .* describes the data",
+        ),
+        (["tables=[table_9]"], r"tables: expected some of table_3_2.*got table_9"),
         (["model._target_=os.system"], r"model: `_target_: os\.system` is outside the modules"),
         (
             ["paths.output_dir=/dev/null/x"],
@@ -168,6 +200,11 @@ def test_a_directory_below_a_file_cannot_be_written(tmp_path):
         "datamodules.cache.shutil.rmtree",
         "lightning.pytorch.trainer.trainer.os.system",
         "torch.optim.optimizer.torch.load",
+        "lightning.pytorch.cli.instantiate_class",
+        "lightning.pytorch.cli.LightningCLI",
+        "lightning.pytorch.profilers.SimpleProfiler",
+        "ljn.tasks.train.train",
+        "ljn.nets.layers.perceptron",
         "ljn.nets.layers.no_such_thing",
     ],
 )

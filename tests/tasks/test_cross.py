@@ -29,6 +29,16 @@ def test_it_has_to_be_said_what_is_trained(smoke_config, tmp_path):
         cross(smoke_config(tmp_path, "task=cross"))
 
 
+def test_a_row_is_configured_as_the_experiment_that_it_trains(run_py, tmp_path):
+    done = run_py(
+        *("experiment=mesh/chain", "task.trains=mesh/basic", "preset=smoke", f"paths.output_dir={tmp_path}"),
+        check=False,
+    )
+    assert done.returncode == 1
+    assert "task.trains: 'mesh/basic' has another model than this row" in done.stderr
+    assert not (tmp_path / "runs").exists()
+
+
 @pytest.mark.parametrize(
     ("override", "message"),
     [

@@ -1,5 +1,7 @@
 import json
+import re
 import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,13 +16,7 @@ from ljn.render import get_renderer
 from ljn.system.keypoints import ORDERS
 from ljn.tasks.predict import predict
 
-README_EXAMPLE = """
-from ljn import Camera, Pipeline
-
-pipeline = Pipeline.load("detector.ckpt", "mesh.ckpt")
-prediction = pipeline(depth, Camera(fx, fy, cx, cy, width, height), keypoints)
-prediction.joints, prediction.vertices, prediction.pose  # (24, 3), (6890, 3) metres, camera frame; (72,)
-"""
+README = Path(__file__).parents[2] / "README.md"
 
 
 @pytest.fixture(scope="session")
@@ -207,13 +203,17 @@ def test_the_pipeline_takes_points_and_normals_from_the_checkpoints(checkpoints)
 
 
 def test_the_readme_s_example_runs(checkpoints, files, kinect, monkeypatch, tmp_path):
+    blocks = re.findall(
+        r"^```python\n(.*?)^```$", README.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL
+    )
+    [example] = [block for block in blocks if "Pipeline.load" in block]
     for name, checkpoint in zip(("detector", "mesh"), checkpoints):
         (tmp_path / f"{name}.ckpt").symlink_to(checkpoint)
     monkeypatch.chdir(tmp_path)
     depth = np.asarray(Image.open(files / "depth.png"))
     depth = np.where(np.asarray(Image.open(files / "mask.png")) > 0, depth, 0)
     names = {"depth": depth, "keypoints": json.loads((files / "keypoints.json").read_text()), **vars(kinect)}
-    exec(README_EXAMPLE, names)
+    exec(example, names)
     prediction = names["prediction"]
     assert (prediction.joints.shape, prediction.vertices.shape, prediction.pose.shape) == (
         (24, 3),

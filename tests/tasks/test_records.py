@@ -108,6 +108,8 @@ def test_the_identity_ignores_paths_loggers_and_workers(compose_config):
         "module.optimizer.lr=0.1",
         "trainer.max_epochs=1",
         "optimized_metric=val/pckh",
+        "callbacks.best.mode=max",
+        "+callbacks.stop={_target_:lightning.pytorch.callbacks.EarlyStopping,monitor:val/mpjpe}",
     ):
         assert hash_of(override) != same, override
     assert config_hash(identity(compose_config("experiment=detector/proposed"), "other")) != same
