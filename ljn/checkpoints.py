@@ -2,8 +2,6 @@
 
 import hashlib
 import os
-import pickle
-import zipfile
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,14 +14,10 @@ from torch import Tensor
 
 from ljn.building import build
 from ljn.modules.base import StageModule
+from ljn.reading import READ_ERRORS
 
 CHECKPOINT_VERSION = 2
 _PROVENANCE_KEY = "ljn"
-# What a damaged file makes PyTorch, pickle and zipfile raise.
-_READ_ERRORS = (
-    AttributeError, EOFError, LookupError, OSError, RuntimeError, TypeError, ValueError, pickle.UnpicklingError,
-    zipfile.BadZipFile,
-)  # fmt: skip
 CONFIG_GROUPS = ("preset", "model", "module", "data", "body", "trainer", "seed", "name", "optimized_metric")
 """The part of a stored configuration that decides what a checkpoint is."""
 
@@ -121,7 +115,7 @@ def read_checkpoint(path: str | Path, name: str = "ckpt_path") -> Checkpoint:
         )
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
-    except _READ_ERRORS as error:
+    except READ_ERRORS as error:
         reason = str(error).strip().split("\n")[0]
         raise ValueError(
             f"{name}: '{path}' is damaged, truncated or no checkpoint at all ({reason}); copy it again, or "

@@ -2,7 +2,6 @@
 
 import json
 import zipfile
-import zlib
 from pathlib import Path
 from typing import NamedTuple
 
@@ -10,6 +9,7 @@ import numpy as np
 
 from datamodules.sources import SPLITS
 from ljn.body.skeleton import NUM_JOINTS
+from ljn.reading import READ_ERRORS
 
 
 class Clips(NamedTuple):
@@ -38,7 +38,7 @@ def read_clips(path: Path) -> Clips:
             raise ValueError("not a .npz archive")
         with np.load(path, allow_pickle=False) as file:
             poses, clip = file["poses"].astype(np.float32), file["clip"].astype(str)
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+    except READ_ERRORS as error:
         raise ValueError(
             f"poses: {path} cannot be read ({error}); expected an .npz file with `poses` (N, 72) and `clip` (N,) "
             "names"

@@ -186,7 +186,7 @@ def _best_and_others(
 
 def _interval(better: Contender, worse: Contender) -> tuple[float, float] | None:
     first, second = _mean_errors(better), _mean_errors(worse)
-    if first is None or second is None or not len(first[0]) or not np.array_equal(first[0], second[0]):
+    if first is None or second is None or not len(first[0]) or not _are_same(first[0], second[0]):
         return None
     return paired_bootstrap(first[1], second[1])
 
@@ -200,6 +200,11 @@ def _mean_errors(row: Contender) -> tuple[np.ndarray, np.ndarray] | None:
     if not errors or len(errors) < len(found):
         return None
     samples = errors[0][0]
-    if any(not np.array_equal(other, samples) for other, _ in errors):
+    if any(not _are_same(other, samples) for other, _ in errors):
         return None
     return samples, np.mean([values for _, values in errors], axis=0)
+
+
+def _are_same(first: np.ndarray, second: np.ndarray) -> bool:
+    """Whether samples are the same ones, up to what machines differ in: hundredths of a millimetre."""
+    return first.shape == second.shape and np.allclose(first, second, rtol=0, atol=1e-5)

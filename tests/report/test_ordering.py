@@ -98,6 +98,16 @@ def test_runs_with_the_errors_of_the_same_samples_get_an_interval(sweep):
     assert entry.interval == pytest.approx((5, 5))
 
 
+def test_samples_that_another_machine_made_are_the_same(sweep):
+    errors = np.random.default_rng(1).uniform(20, 90, 30)
+    sweep.run("detector/basic", {"mpjpe_eq38": 60.0}, errors=errors + 5)
+    path = sweep.run("detector/proposed", {"mpjpe_eq38": 50.0}, errors=errors) / "test_errors.npz"
+    with np.load(path) as arrays:
+        np.savez(path, **dict(arrays) | {"joints": arrays["joints"] + 5e-6})
+    (entry,) = comparisons(sweep.write("table_3_2"))
+    assert entry.interval == pytest.approx((5, 5))
+
+
 @pytest.mark.parametrize(
     "damage", ["fewer samples", "other samples", "no file", "no zip file", "a wrong byte", "another metric"]
 )
