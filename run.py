@@ -13,7 +13,7 @@ import sys
 import hydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 from callbacks.sweep_report import sweep_name
 from ljn.tasks.processes import is_first_process
@@ -28,7 +28,7 @@ def main(cfg: DictConfig) -> float | None:
     if not is_first_process():
         logging.disable(logging.INFO)  # the first process says it for all
     if cfg.group is None and HydraConfig.get().mode == RunMode.MULTIRUN:
-        cfg.group = sweep_name(OmegaConf.create({"hydra": HydraConfig.get()}))
+        cfg.group = sweep_name(HydraConfig.get())
     try:
         metrics = hydra.utils.get_method(cfg.task._target_)(cfg)
     except (ValueError, FileNotFoundError, ImportError, FloatingPointError) as error:

@@ -58,8 +58,9 @@ class SweepReport(Callback):
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
         """See to it that the sweep is summed up however it ends."""
-        self._sweep = config.copy()
-        self._sweep.group = config.group or sweep_name(config)
+        # No copy: a copy's `now` is another time, and its directory another one.
+        self._sweep = config
+        config.group = config.group or sweep_name(config.hydra)
         self._see_to_the_end()
 
     def _see_to_the_end(self) -> None:
@@ -105,7 +106,7 @@ class SweepReport(Callback):
 
     def _gather(self, config: DictConfig) -> Path:
         """Write `sweep.json` from the jobs' notes; returns its directory."""
-        name, preset = sweep_name(config), config.preset.name
+        name, preset = sweep_name(config.hydra), config.preset.name
         directory = self.output_dir / "sweeps" / (name if name == preset else f"{name}-{preset}")
         directory.mkdir(parents=True, exist_ok=True)
         jobs = [note for path in sorted(self._notes(config).glob("*.json")) if (note := read_json(path))]
@@ -132,13 +133,13 @@ class SweepReport(Callback):
         return None if run_dir is None else os.path.relpath(run_dir, self.output_dir)
 
 
-def sweep_name(config: DictConfig) -> str:
+def sweep_name(hydra: Any) -> str:
     """What a multirun is called: a grid of the user's own has no name but the time of its start.
 
     Args:
-        config: With Hydra's own node.
+        hydra: Hydra's own part of the configuration.
     """
-    return config.hydra.runtime.choices.get("sweep") or f"grid-{Path(config.hydra.sweep.dir).name}"
+    return hydra.runtime.choices.get("sweep") or f"grid-{Path(hydra.sweep.dir).name}"
 
 
 def _row(job: dict[str, Any], preset: str) -> tuple[Any, ...]:

@@ -3,6 +3,7 @@ import json
 import numpy as np
 import pytest
 import torch
+import yaml
 
 from ljn.checkpoints import read_checkpoint
 from ljn.tasks.evaluate import evaluate, with_checkpoint_config
@@ -35,7 +36,7 @@ def test_several_checkpoints_go_in_one_multirun_with_other_noise(trained, run_py
     _, run_dir = trained
     other = edited(trained, tmp_path, lambda content: content["state_dict"]["net.head.4.bias"].add_(0.1))
     checkpoints = [run_dir / "checkpoints" / "best.ckpt", other]
-    run_py(
+    done = run_py(
         *(
             "-m",
             "task=evaluate",
@@ -44,8 +45,12 @@ def test_several_checkpoints_go_in_one_multirun_with_other_noise(trained, run_py
         ),
         *("data.keypoint_noise_px=15", "logger=csv"),
     )
+    assert "2 jobs: 0 runs, 2 evaluations" in done.stdout
+    [sweep] = (tmp_path / "sweeps").iterdir()
     evaluated = list((tmp_path / "evaluations").iterdir())
     assert len(evaluated) == 2
+    groups = {yaml.safe_load((directory / "config.yaml").read_text())["group"] for directory in evaluated}
+    assert groups == {sweep.name.removesuffix("-smoke").removesuffix("-small")}
     for directory in evaluated:
         metrics = json.loads((directory / "metrics.json").read_text())
         assert metrics["test/initial_mean_distance_px"] == pytest.approx(15 * np.sqrt(np.pi / 2), rel=0.1)
