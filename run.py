@@ -12,11 +12,9 @@ import sys
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
-from hydra.types import RunMode
 from omegaconf import DictConfig
 
-from callbacks.sweep_report import sweep_name
-from ljn.tasks.processes import is_first_process
+from ljn.tasks.processes import is_first_process, is_job_of_sweep
 from ljn.tasks.schema import register
 
 register()
@@ -27,13 +25,15 @@ def main(cfg: DictConfig) -> float | None:
     """Run the task that `cfg.task` names; returns the metric that `cfg.optimized_metric` names."""
     if not is_first_process():
         logging.disable(logging.INFO)  # the first process says it for all
-    if cfg.group is None and HydraConfig.get().mode == RunMode.MULTIRUN:
+    if cfg.group is None and is_job_of_sweep():
+        from callbacks.sweep_report import sweep_name  # not above: --help should stay quick
+
         cfg.group = sweep_name(HydraConfig.get())
     try:
         metrics = hydra.utils.get_method(cfg.task._target_)(cfg)
     except (ValueError, FileNotFoundError, ImportError, FloatingPointError) as error:
         # A user's mistake: the message names the fix. A sweep needs the exception, a developer the traceback.
-        if HydraConfig.get().mode == RunMode.MULTIRUN or os.environ.get("HYDRA_FULL_ERROR") == "1":
+        if is_job_of_sweep() or os.environ.get("HYDRA_FULL_ERROR") == "1":
             raise
         sys.exit(f"error: {error}\n(HYDRA_FULL_ERROR=1 shows where it was raised)")
     if is_first_process():

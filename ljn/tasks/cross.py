@@ -54,10 +54,14 @@ def cross(cfg: DictConfig) -> dict[str, float]:
 
 
 def _check_trains(cfg: DictConfig) -> None:
-    """Raise a `ValueError` unless the experiment that is said to be trained is configured as this row is."""
-    typed = [line for line in typed_overrides() if not line.startswith(("experiment=", "name=", "task"))]
-    if not typed_overrides():
+    """Raise a `ValueError` unless the experiment that is said to be trained is configured as this row is.
+
+    Without Hydra's own start there is no other experiment to compose: the caller has composed this one.
+    """
+    typed = typed_overrides()
+    if not typed:
         return
+    typed = [line for line in typed if not line.startswith(("experiment=", "name=", "task"))]
     trained = compose("config", [f"experiment={cfg.task.trains}", *typed])
     for group in ("model", "module", "data", "trainer"):
         if trained[group] != cfg[group]:

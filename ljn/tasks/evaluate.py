@@ -112,7 +112,7 @@ def _evaluate(
         "trained_by": checkpoint.run,
         "checkpoint": {"path": str(checkpoint.path), "hash": checkpoint.file_hash, "epoch": checkpoint.epoch},
         "data": datamodule.describe(("test",)),
-        "predicted_body": records.predicted_body(cfg),
+        "predicted_body": "-".join(module.body_hashes) or None,
     }
     with records.RunRecord(run_dir, facts) as record:
         config = save_config(cfg, run_dir)

@@ -78,7 +78,7 @@ def _train(
         "preset": cfg.preset.name,
         "config_hash": identity_hash,
         "data": datamodule.describe(),
-        "predicted_body": records.predicted_body(cfg),
+        "predicted_body": "-".join(module.body_hashes) or None,
         "num_parameters": sum(parameter.numel() for parameter in module.parameters()),
     }
     with records.RunRecord(run_dir, facts) as record:

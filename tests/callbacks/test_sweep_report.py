@@ -1,6 +1,7 @@
 import json
 
 import pytest
+from hydra._internal.callbacks import Callbacks
 from hydra.core.utils import JobReturn, JobStatus
 from hydra.types import RunMode
 from omegaconf import OmegaConf
@@ -60,3 +61,14 @@ def test_a_failure_is_kept_among_the_rows_of_a_later_call_until_it_is_mended(end
 def test_a_failure_with_other_settings_is_forgotten(end_job):
     end_job("first", 0, "a", JobStatus.FAILED, typed=("data.num_points=0",))
     assert len(end_job("second", 0, "b", typed=("data.num_points=64",))) == 1
+
+
+def test_tables_that_cannot_be_written_end_the_call_as_failed(tmp_path, monkeypatch):
+    def broken(self):
+        raise OSError("no space left")
+
+    monkeypatch.setattr(SweepReport, "_sum_up", broken)
+    callbacks = Callbacks()
+    callbacks.callbacks = [SweepReport(tmp_path)]
+    with pytest.raises(SystemExit, match="not their tables: OSError: no space left"):
+        callbacks.on_multirun_end(config=OmegaConf.create())
