@@ -14,8 +14,8 @@ from hydra.types import RunMode
 from omegaconf import DictConfig
 
 from ljn.report import write_report
-from ljn.report.runs import settings
-from ljn.tasks.records import read_json, write_json
+from ljn.runs.files import read_json, write_json
+from ljn.runs.sweep import settings
 
 
 class SweepReport(Callback):

@@ -10,12 +10,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from datamodules.noise import JOINT_NOISES, add_depth_noise, add_joint_noise, add_keypoint_noise
 from datamodules.placement import HEADINGS, check_margin, draw_heading, place
 from datamodules.sources import PoseRecords
 from ljn.body import SMPL, BodyModel
-from ljn.cloud.keypoints import lift_keypoints
+from ljn.cloud.lifting import lift_keypoints
 from ljn.cloud.normals import NORMALS, NormalEstimator, get_normal_estimator
-from ljn.cloud.sampling import add_depth_noise, sample_cloud
+from ljn.cloud.sampling import sample_cloud
 from ljn.data import Batch
 from ljn.geometry.camera import Camera, project
 from ljn.geometry.rotations import CAMERA_FROM_BODY, rotation_about, rotmat_to_rotvec, rotvec_to_rotmat
@@ -25,7 +26,6 @@ from ljn.render import RENDERERS, Renderer, get_renderer
 _PLACEMENT, _DEPTH_NOISE, _SAMPLING, _KEYPOINTS, _JOINTS = range(5)
 
 INITIAL_JOINTS = ("lifted", "noised")
-JOINT_NOISES = ("planar", "isotropic")
 
 
 @dataclass(frozen=True)
@@ -225,41 +225,6 @@ class _Scene(NamedTuple):
     gender: Tensor
     joints: Tensor
     depth: np.ndarray
-
-
-def add_keypoint_noise(
-    keypoints: np.ndarray, noise_px: float, camera: Camera | None, rng: np.random.Generator
-) -> np.ndarray:
-    """2D keypoints as a detector might give them.
-
-    Args:
-        keypoints: `(K, 2)`, pixels.
-        noise_px: Standard deviation of the Gaussian noise on u and on v, pixels.
-        camera: Its image clips the result; None does not clip.
-        rng: Source of the draws; they do not depend on `noise_px`.
-    """
-    noisy = keypoints + noise_px * rng.standard_normal(keypoints.shape)
-    if camera is not None:
-        noisy = noisy.clip(0, [camera.width - 1, camera.height - 1])
-    return noisy.astype(np.float32)
-
-
-def add_joint_noise(joints: np.ndarray, noise_m: float, kind: str, rng: np.random.Generator) -> np.ndarray:
-    """Joints as a joint detector might give them (section 3.6.3).
-
-    Args:
-        joints: `(K, 3)`, metres, camera frame.
-        noise_m: Standard deviation of the Gaussian noise along each direction, metres.
-        kind: `planar` (x and y, whose mean distance sigma * sqrt(pi / 2) is that of Table 3.6) or `isotropic`.
-        rng: Source of the draws; they depend on neither `noise_m` nor `kind`.
-
-    Returns:
-        `(K, 3)` float32.
-    """
-    noise = rng.standard_normal(joints.shape)
-    if kind == "planar":
-        noise[:, 2] = 0
-    return (joints + noise_m * noise).astype(np.float32)
 
 
 def concatenate(batches: Iterable[Batch], num_samples: int) -> dict[str, Tensor]:

@@ -16,12 +16,12 @@ from datamodules.cache import cached_samples
 from datamodules.sources import PoseRecords, PoseSource
 from datamodules.synthesis import DepthSynthesizer, SynthesisSettings, concatenate
 from ljn.body import BodyModel, load_body_models
-from ljn.checkpoints import Checkpoint, load_module
 from ljn.cloud.normals import get_normal_estimator
 from ljn.data import EMBEDDED_DATA_VERSION, SPLITS, Batch, BodyDataModule
 from ljn.geometry.camera import Camera
 from ljn.modules.joint_detector import JointDetector
 from ljn.render import get_renderer
+from ljn.runs.checkpoints import Checkpoint, load_module
 
 _LOG = logging.getLogger(__name__)
 _CHUNK = 16

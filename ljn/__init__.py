@@ -12,7 +12,7 @@ _PUBLIC = {
     "Camera": "ljn.geometry.camera",
     "SMPL": "ljn.body.smpl",
     "JointDetector": "ljn.modules.joint_detector",
-    "Pipeline": "ljn.system.pipeline",
+    "Pipeline": "ljn.pipeline.pipeline",
     "get_renderer": "ljn.render",
 }
 __all__ = ["SMPL", "Camera", "JointDetector", "Pipeline", "__version__", "get_renderer"]

@@ -11,6 +11,7 @@ from datamodules.placement import draw_heading
 from datamodules.sources.embedded import EmbeddedSource
 from datamodules.synthetic import SyntheticDepthDataModule
 from ljn.body import SMPL, load_body_model, load_body_models
+from ljn.body.kinematics import joint_offsets
 from ljn.geometry.camera import Camera
 from ljn.geometry.rotations import CAMERA_FROM_BODY, rotation_about, rotmat_to_rotvec, rotvec_to_rotmat
 from ljn.optional import import_open3d, import_pyrender
@@ -44,6 +45,12 @@ def kinect():
 def body():
     """The neutral body."""
     return load_body_model()
+
+
+@pytest.fixture(scope="session")
+def offsets(body):
+    """Its joints' rest positions relative to their parents."""
+    return joint_offsets(body)
 
 
 @pytest.fixture(scope="session")

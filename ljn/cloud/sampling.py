@@ -1,4 +1,4 @@
-"""Sensor noise on a depth image and the random choice of the pixels that become points."""
+"""The random choice of the pixels that become points."""
 
 from typing import NamedTuple
 
@@ -18,24 +18,6 @@ class Cloud(NamedTuple):
 
     points: np.ndarray
     pixels: np.ndarray
-
-
-def add_depth_noise(
-    depth: np.ndarray, noise_std_m: float, rng: np.random.Generator, in_place: bool = False
-) -> np.ndarray:
-    """A depth image with Gaussian noise on the body's pixels (section 3.6.1).
-
-    Args:
-        depth: `(H, W)` float32, metres; 0 is background and stays 0.
-        noise_std_m: Standard deviation, metres.
-        rng: Source of the draws; they do not depend on `noise_std_m`.
-        in_place: Whether `depth` itself gets the noise, or a copy.
-    """
-    noisy = depth if in_place else depth.copy()
-    flat = noisy.reshape(-1)
-    foreground = np.flatnonzero(flat > 0)
-    flat[foreground] += np.float32(noise_std_m) * rng.standard_normal(len(foreground), dtype=np.float32)
-    return noisy
 
 
 def sample_cloud(depth: np.ndarray, camera: Camera, num_points: int, rng: np.random.Generator) -> Cloud:

@@ -7,8 +7,8 @@ from itertools import combinations
 
 import numpy as np
 
-from ljn.report.runs import Run
 from ljn.report.tables import Column
+from ljn.runs.sweep import Run
 
 NUM_RESAMPLES = 1000
 _SEED = 0

@@ -7,8 +7,8 @@ from ljn.report import sections, writers
 from ljn.report.charts import Series, line_chart
 from ljn.report.ordering import verdict
 from ljn.report.results import Cell, Results, RowResult, TableResult
-from ljn.report.runs import Run
 from ljn.report.style import STYLE
+from ljn.runs.sweep import Run
 
 # A page that asks for anything from elsewhere is stopped by the browser.
 _POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"

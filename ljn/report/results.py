@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 from ljn.report.ordering import Comparison, Contender, compare, count_claims
-from ljn.report.runs import Run, Sweep, read_sweep, varying
 from ljn.report.tables import (
     APVE,
     MPJPE,
@@ -22,6 +21,7 @@ from ljn.report.tables import (
     Row,
     Table,
 )
+from ljn.runs.sweep import Run, Sweep, read_sweep, varying
 
 _STAGES = {"detector": ("joint detectors", (MPJPE, PCKH)), "mesh": ("mesh regressors", (APVE, MPJPE))}
 """What a stage's models are called, and its metrics, by the folder of its experiments."""

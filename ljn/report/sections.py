@@ -11,9 +11,9 @@ from typing import Any
 from PIL import Image
 
 from ljn.report.results import Results
-from ljn.report.runs import Run
 from ljn.report.tables import NUM_DATA
 from ljn.report.writers import NONE
+from ljn.runs.sweep import Run
 
 _MAX_PICTURE_PX = 1600
 _MISSING = '<span class="word">missing</span>'

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 from ljn.report.ordering import Comparison, verdict
 from ljn.report.results import Cell, Results, RowResult, TableResult
-from ljn.report.runs import Run
 from ljn.report.tables import Column
+from ljn.runs.sweep import Run
 
 NONE = "–"
 

@@ -10,9 +10,11 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
 
 from ljn.building import build, check_targets
-from ljn.checkpoints import CONFIG_GROUPS, Checkpoint, load_state, read_checkpoint
 from ljn.data import BodyDataModule
-from ljn.tasks import records
+from ljn.runs.checkpoints import CONFIG_GROUPS, Checkpoint, load_state, read_checkpoint
+from ljn.runs.files import read_json, write_json
+from ljn.runs.identity import config_hash, identity
+from ljn.runs.record import RunRecord, alone_in, is_complete
 from ljn.tasks.tracking import tracking
 from ljn.tasks.train import (
     build_trainer,
@@ -87,14 +89,14 @@ def evaluate_checkpoint(
 
     datamodule: BodyDataModule = build(cfg.data)
     datamodule.prepare_data()
-    identity = {**records.identity(cfg, datamodule.fingerprint), "checkpoint": checkpoint.file_hash}
-    identity_hash = records.config_hash(identity)
+    evaluated = {**identity(cfg, datamodule.fingerprint), "checkpoint": checkpoint.file_hash}
+    identity_hash = config_hash(evaluated)
     run_dir = set_run_directory(cfg, "evaluations", identity_hash)
     call.paths.run_dir = str(run_dir)
-    with records.alone_in(run_dir):
-        if reuses and not call.rerun and records.is_complete(run_dir, identity_hash):
+    with alone_in(run_dir):
+        if reuses and not call.rerun and is_complete(run_dir, identity_hash):
             _LOG.info("%s is complete; evaluate it again with rerun=true", run_dir)
-            return records.read_json(run_dir / "metrics.json") or {}
+            return read_json(run_dir / "metrics.json") or {}
         return _evaluate(cfg, datamodule, checkpoint, run_dir, identity_hash)
 
 
@@ -114,7 +116,7 @@ def _evaluate(
         "data": datamodule.describe(("test",)),
         "predicted_body": "-".join(module.body_hashes) or None,
     }
-    with records.RunRecord(run_dir, facts) as record:
+    with RunRecord(run_dir, facts) as record:
         config = save_config(cfg, run_dir)
         trainer = build_trainer(cfg, run_dir, config, datamodule, module)
         record.add(device=str(trainer.strategy.root_device), num_threads=torch.get_num_threads())
@@ -122,7 +124,7 @@ def _evaluate(
             trainer.test(module, datamodule, verbose=False)
             metrics = finite_metrics(trainer)
         if trainer.is_global_zero:
-            records.write_json(run_dir / "metrics.json", metrics)
+            write_json(run_dir / "metrics.json", metrics)
     _LOG.info("%s on %s: %s", checkpoint.run, cfg.name, run_dir)
     return metrics
 

@@ -10,14 +10,14 @@ from omegaconf import DictConfig
 
 from ljn.body.skeleton import ROOT
 from ljn.building import build
-from ljn.checkpoints import load_module
 from ljn.data import Batch, BodyDataModule
 from ljn.drawing import MeshSample, Sample, draw_meshes, draw_samples
 from ljn.metrics import mpjpe
 from ljn.modules.joint_detector import JointDetector
 from ljn.modules.mesh_regressor import MeshRegressor
+from ljn.runs.checkpoints import load_module
+from ljn.runs.files import write_json
 from ljn.tasks.evaluate import check_bodies, typed_overrides, with_checkpoint_config
-from ljn.tasks.records import write_json
 from ljn.tasks.train import prepare_process
 from ljn.tasks.validation import check_writable, validate
 

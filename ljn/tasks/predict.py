@@ -14,13 +14,13 @@ from tqdm import tqdm
 
 from ljn.body.skeleton import JOINT_NAMES
 from ljn.geometry.camera import Camera
-from ljn.system.depth import body_depth
-from ljn.system.distance import distances_to_mesh
-from ljn.system.export import import_trimesh, write_arrays, write_mesh
-from ljn.system.files import DEPTH_SUFFIXES, read_camera, read_depth, read_keypoints, read_mask
-from ljn.system.pictures import draw_prediction
-from ljn.system.pipeline import Observation, Pipeline, Prediction
-from ljn.tasks.records import write_json
+from ljn.geometry.distance import distances_to_mesh
+from ljn.pipeline.depth import body_depth
+from ljn.pipeline.inputs import DEPTH_SUFFIXES, read_camera, read_depth, read_keypoints, read_mask
+from ljn.pipeline.pictures import draw_prediction
+from ljn.pipeline.pipeline import Observation, Pipeline, Prediction
+from ljn.pipeline.writing import import_trimesh, write_arrays, write_mesh
+from ljn.runs.files import write_json
 from ljn.tasks.validation import check_writable
 
 _LOG = logging.getLogger(__name__)

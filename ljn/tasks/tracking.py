@@ -10,7 +10,7 @@ import lightning.pytorch as lightning
 from hydra.utils import get_class
 from lightning.pytorch.loggers import WandbLogger
 
-from ljn.tasks.records import config_hash
+from ljn.runs.identity import config_hash
 
 
 @contextmanager

@@ -12,10 +12,12 @@ import torch
 from omegaconf import DictConfig, OmegaConf, open_dict
 
 from ljn.building import build, build_each
-from ljn.checkpoints import AtomicCheckpointIO, Provenance, read_checkpoint
 from ljn.data import BodyDataModule
 from ljn.modules.base import StageModule
-from ljn.tasks import records
+from ljn.runs.checkpoints import AtomicCheckpointIO, Provenance, read_checkpoint
+from ljn.runs.files import read_json, write_json
+from ljn.runs.identity import config_hash, identity
+from ljn.runs.record import RunRecord, alone_in, is_complete
 from ljn.tasks.processes import check_trains_in_processes, is_first_process, num_processes, own_devices
 from ljn.tasks.tracking import tracking
 from ljn.tasks.validation import validate
@@ -52,12 +54,12 @@ def train(cfg: DictConfig) -> dict[str, float]:
     validate(cfg)
     datamodule: BodyDataModule = build(cfg.data)
     datamodule.prepare_data()
-    identity_hash = records.config_hash(records.identity(cfg, datamodule.fingerprint))
+    identity_hash = config_hash(identity(cfg, datamodule.fingerprint))
     run_dir = set_run_directory(cfg, "runs", identity_hash)
-    with records.alone_in(run_dir):
-        if records.is_complete(run_dir, identity_hash) and not cfg.rerun:
+    with alone_in(run_dir):
+        if is_complete(run_dir, identity_hash) and not cfg.rerun:
             _LOG.info("%s is complete; train it again with rerun=true", run_dir)
-            return records.read_json(run_dir / "metrics.json") or {}
+            return read_json(run_dir / "metrics.json") or {}
         return _train(cfg, datamodule, run_dir, identity_hash)
 
 
@@ -81,7 +83,7 @@ def _train(
         "predicted_body": "-".join(module.body_hashes) or None,
         "num_parameters": sum(parameter.numel() for parameter in module.parameters()),
     }
-    with records.RunRecord(run_dir, facts) as record:
+    with RunRecord(run_dir, facts) as record:
         config = save_config(cfg, run_dir)
         trainer = build_trainer(cfg, run_dir, config, datamodule, module)
         record.add(
@@ -105,7 +107,7 @@ def _train(
             trainer.test(module, datamodule, ckpt_path=best, verbose=False, weights_only=True)
             metrics |= finite_metrics(trainer)
         if trainer.is_global_zero:
-            records.write_json(run_dir / "metrics.json", metrics)
+            write_json(run_dir / "metrics.json", metrics)
     return metrics
 
 

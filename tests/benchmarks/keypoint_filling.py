@@ -1,7 +1,7 @@
 """How well missing keypoints are filled in, and the file that it is done with.
 
 python -m tests.benchmarks.keypoint_filling            prints the table
-python -m tests.benchmarks.keypoint_filling --write    first makes ljn/system/data/joint_covariance.npz anew
+python -m tests.benchmarks.keypoint_filling --write    first makes ljn/pipeline/data/joint_covariance.npz anew
 
 Errors are in pixels of the training camera, over embedded test poses placed as in training.
 """
@@ -17,7 +17,7 @@ from datamodules.synthesis import DepthSynthesizer, SynthesisSettings
 from ljn.body import SMPL, load_body_models
 from ljn.body.skeleton import JOINT_INDEX, JOINT_NAMES, NUM_JOINTS, PARENTS
 from ljn.geometry.camera import Camera
-from ljn.system.keypoints import COVARIANCE_PATH, MIN_KNOWN, ORDERS, fill_missing
+from ljn.pipeline.keypoints import COVARIANCE_PATH, MIN_KNOWN, ORDERS, fill_missing
 
 CAMERA = Camera(fx=366.458, fy=366.736, cx=206.470, cy=253.026, width=424, height=512)
 NUM_TRAIN, NUM_TEST, SEED = 8192, 1024, 0

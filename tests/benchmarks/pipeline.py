@@ -16,12 +16,13 @@ import torch
 from torch import Tensor
 from torch.utils.data import DataLoader
 
+from datamodules.noise import add_depth_noise
 from datamodules.sources.embedded import EmbeddedSource
 from datamodules.synthesis import DepthSynthesizer, SynthesisSettings
 from datamodules.synthetic import SynthesizedSamples
 from ljn.body import SMPL, SMPLOutput, load_body_models
 from ljn.cloud.normals import get_normal_estimator
-from ljn.cloud.sampling import add_depth_noise, sample_cloud
+from ljn.cloud.sampling import sample_cloud
 from ljn.geometry.camera import Camera
 from ljn.geometry.rotations import CAMERA_FROM_BODY
 from ljn.nets.joint_network import LocalJointNetwork

@@ -25,14 +25,13 @@ from torch import Tensor
 from datamodules.placement import floor_height
 from datamodules.sources import SPLITS, PoseRecords
 from datamodules.sources.embedded import EmbeddedSource
-from datamodules.sources.generation.joint_limits import ARM_AXES, RANGES, Ranges, within_limits
-from datamodules.sources.generation.kinematics import SIDES, joint_positions, mirror, world_rotations
-from datamodules.sources.generation.mixture import PoseMixture
-from datamodules.sources.generation.penetration import penetration
-from datamodules.sources.generation.reference import REFERENCE_CAPSULES, REFERENCE_OFFSETS
+from datamodules.sources.embedded.joint_limits import ARM_AXES, RANGES, Ranges, within_limits
+from datamodules.sources.embedded.mixture import PoseMixture
+from datamodules.sources.embedded.penetration import penetration
+from datamodules.sources.embedded.reference import REFERENCE_CAPSULES, REFERENCE_OFFSETS
 from ljn.body import SMPL, load_body_models
+from ljn.body.kinematics import SIDES, joint_positions, mirror, world_rotations
 from ljn.body.skeleton import JOINT_INDEX, NUM_JOINTS, ROOT
-from ljn.drawing import shade_mesh
 from ljn.geometry.camera import Camera
 from ljn.geometry.rotations import (
     CAMERA_FROM_BODY,
@@ -41,6 +40,7 @@ from ljn.geometry.rotations import (
     rotmat_to_rotvec,
     rotvec_to_rotmat,
 )
+from ljn.render.shading import shade_mesh
 
 NUM_POOL, NUM_QUERIES, NUM_REAL = 20_000, 2_500, 30_000
 HELD_OUT = ("01", "03", "06", "08", "09", "11")

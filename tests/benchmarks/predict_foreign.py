@@ -13,14 +13,14 @@ import argparse
 import numpy as np
 import torch
 
+from datamodules.noise import add_depth_noise
 from ljn import Camera, Pipeline, get_renderer
 from ljn.body.skeleton import JOINT_INDEX, ROOT
-from ljn.cloud.sampling import add_depth_noise
 from ljn.geometry.camera import place_at_root, project
-from ljn.system.distance import distances_to_mesh
-from ljn.system.keypoints import ORDERS
-from ljn.system.pictures import draw_prediction
-from ljn.system.pipeline import Prediction
+from ljn.geometry.distance import distances_to_mesh
+from ljn.pipeline.keypoints import ORDERS
+from ljn.pipeline.pictures import draw_prediction
+from ljn.pipeline.pipeline import Prediction
 
 # Where COCO's keypoints are among MHR's 70: nose, eyes, ears, shoulders, elbows, wrists, hips, knees, ankles.
 COCO_OF_MHR = (0, 1, 2, 3, 4, 5, 6, 7, 8, 62, 41, 9, 10, 11, 12, 13, 14)

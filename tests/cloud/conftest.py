@@ -2,8 +2,9 @@ import numpy as np
 import pytest
 import torch
 
+from datamodules.noise import add_depth_noise
 from datamodules.placement import place
-from ljn.cloud.sampling import add_depth_noise, sample_cloud
+from ljn.cloud.sampling import sample_cloud
 from ljn.render import get_renderer
 
 

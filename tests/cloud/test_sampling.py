@@ -2,7 +2,8 @@ import numpy as np
 import pytest
 import torch
 
-from ljn.cloud.sampling import add_depth_noise, sample_cloud
+from datamodules.noise import add_depth_noise
+from ljn.cloud.sampling import sample_cloud
 from ljn.geometry.camera import Camera, project
 
 CAMERA = Camera(fx=50.0, fy=52.0, cx=31.2, cy=23.9, width=64, height=48)

@@ -10,10 +10,10 @@ from omegaconf import OmegaConf
 
 from datamodules.sources import SPLITS, PoseRecords
 from datamodules.sources.embedded import EmbeddedSource
-from datamodules.sources.generation import mixture as mixture_module
-from datamodules.sources.generation.joint_limits import with_square_elbows, within_limits
-from datamodules.sources.generation.kinematics import mirror, without_heading
+from datamodules.sources.embedded import mixture as mixture_module
+from datamodules.sources.embedded.joint_limits import with_square_elbows, within_limits
 from ljn.body import GENDERS, SMPL
+from ljn.body.kinematics import mirror, without_heading
 from ljn.body.skeleton import MIRROR, NUM_JOINTS, ROOT
 from ljn.geometry.rotations import (
     rotmat_to_rotvec,
@@ -318,7 +318,7 @@ def test_the_fingerprint_follows_files_settings_body_and_version(write_source, m
         source = write_source()
         source.__dict__["_body"] = type("Body", (), {"hash": "other"})
         yield source.fingerprint
-        monkeypatch.setattr("datamodules.sources.embedded.EMBEDDED_DATA_VERSION", -1)
+        monkeypatch.setattr("datamodules.sources.embedded.source.EMBEDDED_DATA_VERSION", -1)
         yield write_source().fingerprint
 
     found = list(prints())

@@ -9,8 +9,9 @@ import pytest
 import torch
 from torch.utils.data import DataLoader
 
+from datamodules.noise import add_keypoint_noise
 from datamodules.sources import PoseRecords
-from datamodules.synthesis import DepthSynthesizer, SynthesisSettings, add_keypoint_noise, concatenate
+from datamodules.synthesis import DepthSynthesizer, SynthesisSettings, concatenate
 from ljn.body import SMPL
 from ljn.body.skeleton import JOINT_INDEX, ROOT
 from ljn.data import Batch

@@ -6,8 +6,8 @@ import sys
 import pytest
 
 from ljn.report.results import read_results
-from ljn.report.runs import read_sweep
 from ljn.report.tables import ROOT_ALIGNED_NOTE
+from ljn.runs.sweep import read_sweep
 
 
 def cells(directory, table=0):

@@ -64,7 +64,7 @@ def write_checkpoint(smoke_config, tmp_path_factory):
     """Write the checkpoint of an experiment's untrained module as a run does; returns its path."""
     from ljn.body import load_body_models
     from ljn.building import build
-    from ljn.checkpoints import Provenance
+    from ljn.runs.checkpoints import Provenance
 
     data_hashes = [body.hash for body in load_body_models(None, ["female", "male"])]
 

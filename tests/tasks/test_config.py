@@ -195,7 +195,7 @@ def test_a_directory_below_a_file_cannot_be_written(tmp_path):
         "builtins.eval",
         "torch.load",
         "subprocess.run",
-        "ljn.tasks.records.subprocess.run",
+        "ljn.runs.record.subprocess.run",
         "ljn.tasks.train.os.system",
         "datamodules.cache.shutil.rmtree",
         "lightning.pytorch.trainer.trainer.os.system",

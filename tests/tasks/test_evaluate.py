@@ -5,7 +5,7 @@ import pytest
 import torch
 import yaml
 
-from ljn.checkpoints import read_checkpoint
+from ljn.runs.checkpoints import read_checkpoint
 from ljn.tasks.evaluate import evaluate, with_checkpoint_config
 
 

@@ -12,8 +12,8 @@ import ljn.tasks.predict
 from ljn import SMPL, Pipeline
 from ljn.body.skeleton import JOINT_INDEX, ROOT
 from ljn.geometry.camera import project
+from ljn.pipeline.keypoints import ORDERS
 from ljn.render import get_renderer
-from ljn.system.keypoints import ORDERS
 from ljn.tasks.predict import predict
 
 README = Path(__file__).parents[2] / "README.md"

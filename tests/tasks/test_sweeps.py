@@ -11,7 +11,8 @@ from omegaconf import OmegaConf
 
 from ljn.building import build
 from ljn.report.tables import TABLES
-from ljn.tasks import records
+from ljn.runs.files import read_json
+from ljn.runs.identity import config_hash, identity
 
 ROOT = Path(__file__).parents[2]
 SWEEPS = {path.stem: OmegaConf.load(path) for path in (ROOT / "conf" / "sweep").glob("*.yaml")}
@@ -40,7 +41,7 @@ def test_all_tables_train_each_distinct_configuration_once(smoke_config, tmp_pat
     for experiment in experiments("all_tables"):
         cfg = smoke_config(tmp_path, f"experiment={experiment}")
         if cfg.task._target_.endswith("train"):
-            hashes[experiment] = records.config_hash(records.identity(cfg, build(cfg.data).fingerprint))
+            hashes[experiment] = config_hash(identity(cfg, build(cfg.data).fingerprint))
         else:
             trained = smoke_config(tmp_path, f"experiment={cfg.task.trains}")
             # What an evaluation trains is another row's run.
@@ -95,7 +96,7 @@ def test_a_killed_sweep_is_finished_by_the_same_command_with_the_same_table(tmp_
         time.sleep(0.1)
     killed.send_signal(signal.SIGKILL)
     killed.communicate(timeout=60)
-    complete = [path for path in started if records.read_json(path)["status"] == "complete"]
+    complete = [path for path in started if read_json(path)["status"] == "complete"]
     assert len(started) == 3
     assert len(complete) == 2
     before = {path: path.stat().st_mtime_ns for path in complete}

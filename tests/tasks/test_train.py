@@ -179,7 +179,7 @@ def test_a_damaged_checkpoint_to_resume_from_is_named(smoke_config, tmp_path):
 
 def test_another_content_of_the_pose_file_is_another_run(smoke_config, tmp_path):
     from ljn.building import build
-    from ljn.tasks import records
+    from ljn.runs.identity import config_hash, identity
 
     hashes = []
     for value in (0.0, 0.1):
@@ -193,7 +193,7 @@ def test_another_content_of_the_pose_file_is_another_run(smoke_config, tmp_path)
         cfg = smoke_config(tmp_path, *files)
         datamodule = build(cfg.data)
         assert "own file poses.npz" in datamodule.licence
-        hashes.append(records.config_hash(records.identity(cfg, datamodule.fingerprint)))
+        hashes.append(config_hash(identity(cfg, datamodule.fingerprint)))
     assert hashes[0] != hashes[1]
 
 

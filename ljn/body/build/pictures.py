@@ -10,9 +10,10 @@ from ljn.body.build.measures import posed
 from ljn.body.build.poses import ARMS_DOWN, EXTREME_POSES, pose_vector
 from ljn.body.files import NUM_BETAS, BodyModel
 from ljn.body.parts import PART_NAMES, face_parts
-from ljn.drawing import SKIN, new_figure, shade_mesh
+from ljn.drawing import new_figure
 from ljn.geometry.camera import Camera
 from ljn.geometry.rotations import rotation_about
+from ljn.render.shading import SKIN, shade_mesh
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]

@@ -5,8 +5,7 @@ fits it to the 30 nearest of the sampled points alone, as the thesis does with O
 gives the same to within rounding. Which of the two fits it is changes what a network sees, so it is part of a
 run's configuration.
 
-The estimators of this package work on one cloud at a time, in NumPy and numba; `batched` has the same for torch
-tensors on any device. Each estimator is imported when it is first asked for.
+The estimators work on one cloud at a time, in NumPy and numba; each is imported when it is first asked for.
 """
 
 from collections.abc import Callable

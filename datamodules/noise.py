@@ -1,0 +1,60 @@
+"""The noise of training data: on depth images, on 2D keypoints and on 3D joints."""
+
+import numpy as np
+
+from ljn.geometry.camera import Camera
+
+JOINT_NOISES = ("planar", "isotropic")
+
+
+def add_depth_noise(
+    depth: np.ndarray, noise_std_m: float, rng: np.random.Generator, in_place: bool = False
+) -> np.ndarray:
+    """A depth image with Gaussian noise on the body's pixels (section 3.6.1).
+
+    Args:
+        depth: `(H, W)` float32, metres; 0 is background and stays 0.
+        noise_std_m: Standard deviation, metres.
+        rng: Source of the draws; they do not depend on `noise_std_m`.
+        in_place: Whether `depth` itself gets the noise, or a copy.
+    """
+    noisy = depth if in_place else depth.copy()
+    flat = noisy.reshape(-1)
+    foreground = np.flatnonzero(flat > 0)
+    flat[foreground] += np.float32(noise_std_m) * rng.standard_normal(len(foreground), dtype=np.float32)
+    return noisy
+
+
+def add_keypoint_noise(
+    keypoints: np.ndarray, noise_px: float, camera: Camera | None, rng: np.random.Generator
+) -> np.ndarray:
+    """2D keypoints as a detector might give them.
+
+    Args:
+        keypoints: `(K, 2)`, pixels.
+        noise_px: Standard deviation of the Gaussian noise on u and on v, pixels.
+        camera: Its image clips the result; None does not clip.
+        rng: Source of the draws; they do not depend on `noise_px`.
+    """
+    noisy = keypoints + noise_px * rng.standard_normal(keypoints.shape)
+    if camera is not None:
+        noisy = noisy.clip(0, [camera.width - 1, camera.height - 1])
+    return noisy.astype(np.float32)
+
+
+def add_joint_noise(joints: np.ndarray, noise_m: float, kind: str, rng: np.random.Generator) -> np.ndarray:
+    """Joints as a joint detector might give them (section 3.6.3).
+
+    Args:
+        joints: `(K, 3)`, metres, camera frame.
+        noise_m: Standard deviation of the Gaussian noise along each direction, metres.
+        kind: `planar` (x and y, whose mean distance sigma * sqrt(pi / 2) is that of Table 3.6) or `isotropic`.
+        rng: Source of the draws; they depend on neither `noise_m` nor `kind`.
+
+    Returns:
+        `(K, 3)` float32.
+    """
+    noise = rng.standard_normal(joints.shape)
+    if kind == "planar":
+        noise[:, 2] = 0
+    return (joints + noise_m * noise).astype(np.float32)

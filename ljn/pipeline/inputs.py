@@ -1,0 +1,155 @@
+"""Reading what a user has: depth images, masks, cameras and keypoints."""
+
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from ljn.geometry.camera import Camera
+from ljn.reading import READ_ERRORS
+
+DEPTH_SUFFIXES = (".png", ".npy", ".npz")
+_GREY = ("1", "L", "I", "I;16", "I;16B", "F")  # Pillow's modes of one channel
+_CAMERA_KEYS = ("fx", "fy", "cx", "cy", "width", "height")
+
+
+def read_depth(path: str | Path) -> np.ndarray:
+    """A depth image as it is stored: integer millimetres or floating-point metres.
+
+    Args:
+        path: A PNG of 16 bits, a `.npy`, or a `.npz` that holds one array or one with the key `depth`.
+
+    Returns:
+        The array, unchecked; `ljn.pipeline.depth.body_depth` checks it.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: It cannot be read, or is not a depth image.
+    """
+    path = _existing(path, "depth")
+    if path.suffix.lower() not in DEPTH_SUFFIXES:
+        raise ValueError(f"depth: expected one of {', '.join(DEPTH_SUFFIXES)}, got '{path}'")
+    if path.suffix.lower() == ".png":
+        image = _read_png(path, "depth")
+        if image.ndim != 2 or image.dtype.itemsize < 2:
+            raise ValueError(
+                f"depth: expected a PNG of 16 bits with one channel, millimetres; '{path}' has {image.dtype} and shape "
+                f"{image.shape}: a picture of the depth? Save the sensor's own values"
+            )
+        return image
+    try:
+        with path.open("rb") as file:
+            content = np.load(file, allow_pickle=False)
+            if isinstance(content, np.ndarray):
+                return content
+            names = content.files
+            if len(names) == 1 or "depth" in names:
+                array = content["depth" if "depth" in names else names[0]]
+                if not isinstance(array, np.ndarray):
+                    raise TypeError("its entry is no array")
+                return array
+    except READ_ERRORS as error:
+        raise _unreadable("depth", path, error) from error
+    raise ValueError(f"depth: expected one array or one with the key 'depth' in '{path}', got {names}")
+
+
+def read_mask(path: str | Path) -> np.ndarray:
+    """A mask `(H, W)` bool from a PNG: wherever any channel but alpha is not 0.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: It cannot be read.
+    """
+    image = _read_png(_existing(path, "mask"), "mask")
+    return image != 0 if image.ndim == 2 else np.logical_or.reduce(image, -1)
+
+
+def read_camera(path: str | Path) -> Camera:
+    """A camera from YAML or JSON with fx, fy, cx, cy, width and height, pixels; pixel centres at integers.
+
+    Cameras here have no distortion: undistort images first. Keys that begin with `_` are passed over, so the files in
+    `conf/data/camera` can be read.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: It cannot be read, keys are missing or unknown, or a value is not what its key needs.
+    """
+    path = _existing(path, "camera")
+    try:
+        content = yaml.safe_load(path.read_text())
+    except (yaml.YAMLError, *READ_ERRORS) as error:
+        raise _unreadable("camera", path, error) from error
+    if not isinstance(content, dict):
+        raise ValueError(f"camera: expected the keys {', '.join(_CAMERA_KEYS)} in '{path}', got {content!r}")
+    values = {str(key): value for key, value in content.items() if not str(key).startswith("_")}
+    for problem, names in (
+        ("are missing", [key for key in _CAMERA_KEYS if key not in values]),
+        (
+            "are unknown (there is no distortion here: undistort the images)",
+            sorted(values.keys() - set(_CAMERA_KEYS)),
+        ),
+    ):
+        if names:
+            raise ValueError(
+                f"camera: expected the keys {', '.join(_CAMERA_KEYS)} in '{path}': {', '.join(names)} {problem}"
+            )
+    fx, fy, cx, cy, width, height = (_camera_number(values[key], key, path) for key in _CAMERA_KEYS)
+    for key, size in (("width", width), ("height", height)):
+        if not size.is_integer():
+            raise ValueError(
+                f"camera: {key}: expected a whole number of pixels in '{path}', got {size:g}; give the image's own size"
+            )
+    return Camera(fx, fy, cx, cy, int(width), int(height))
+
+
+def read_keypoints(path: str | Path) -> Any:
+    """Keypoints from JSON, in any of the forms that `smpl_keypoints` takes and checks.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: It is not JSON.
+    """
+    path = _existing(path, "keypoints")
+    try:
+        return json.loads(path.read_text())
+    except READ_ERRORS as error:
+        raise _unreadable("keypoints", path, error) from error
+
+
+def _camera_number(value: Any, key: str, path: Path) -> float:
+    try:
+        # YAML takes 3.6e2, which JSON may hold, for text.
+        number = math.nan if isinstance(value, bool) else float(value)
+    except (TypeError, ValueError, OverflowError):
+        number = math.nan
+    if not math.isfinite(number):
+        raise ValueError(
+            f"camera: {key}: expected a finite number in '{path}', got {value!r}; give it in pixels, such as {key}: 366"
+        )
+    return number
+
+
+def _read_png(path: Path, name: str) -> np.ndarray:
+    from PIL import Image
+
+    unreadable: tuple[type[Exception], ...] = (Image.DecompressionBombError, *READ_ERRORS)
+    try:
+        with Image.open(path) as image:
+            return np.asarray(image if image.mode in _GREY else image.convert("RGB"))
+    except unreadable as error:
+        raise _unreadable(name, path, error) from error
+
+
+def _existing(path: str | Path, name: str) -> Path:
+    path = Path(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"{name}: no file '{path}'")
+    return path
+
+
+def _unreadable(name: str, path: Path, error: Exception) -> ValueError:
+    reason = str(error).strip().split("\n")[0] or type(error).__name__
+    return ValueError(f"{name}: '{path}' is damaged, cut off or of another format ({reason}); write it again")

@@ -1,0 +1,49 @@
+"""Smoothly shaded pictures of meshes, without a display."""
+
+import numpy as np
+import torch
+
+from ljn.geometry.camera import Camera
+from ljn.render import get_renderer
+
+SKIN = (0.80, 0.72, 0.66)
+# Towards the light, in the camera frame: from behind the camera's left shoulder.
+_LIGHT = np.array([-0.25, -0.35, -0.90])
+
+
+def shade_mesh(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    camera: Camera,
+    colour: tuple[float, float, float] | np.ndarray = SKIN,
+    background: float | np.ndarray = 1.0,
+) -> np.ndarray:
+    """A picture of a mesh, smoothly shaded.
+
+    Args:
+        vertices: `(V, 3)`, metres, camera frame, in front of the camera.
+        faces: `(F, 3)`, vertex indices, outwards counter-clockwise.
+        camera: The camera.
+        colour: RGB in 0-1, one or `(F, 3)`, one for each face.
+        background: What is seen beside the mesh: grey (NaN to find out where the mesh is), or an image `(H, W, 3)`.
+
+    Returns:
+        `(H, W, 3)` RGB in 0-1.
+    """
+    corners = vertices[faces]
+    face_normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals = np.zeros((len(vertices), 3))
+    for corner in range(3):
+        np.add.at(normals, faces[:, corner], face_normals)
+    seen = get_renderer("zbuffer").fragments(
+        torch.from_numpy(np.ascontiguousarray(vertices, dtype=np.float64))[None],
+        torch.tensor(faces),
+        camera,
+    )
+    face_ids, shares = seen.face_ids[0].numpy(), seen.barycentrics[0].numpy()
+    normal = (normals[faces[face_ids]] * shares[..., None]).sum(-2)
+    normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
+    light = np.clip(normal @ (_LIGHT / np.linalg.norm(_LIGHT)), 0, 1)
+    albedo = np.broadcast_to(np.asarray(colour, np.float64), (len(faces), 3))[face_ids]
+    lit = albedo * (0.25 + 0.75 * light)[..., None]
+    return np.where((face_ids >= 0)[..., None], lit, background)

@@ -1,0 +1,203 @@
+import json
+import struct
+import zipfile
+import zlib
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from ljn.geometry.camera import Camera
+from ljn.pipeline.inputs import read_camera, read_depth, read_keypoints, read_mask
+from ljn.pipeline.writing import write_arrays, write_mesh
+
+CAMERA = Camera(fx=100.5, fy=101.0, cx=10.0, cy=9.0, width=24, height=20)
+
+
+@pytest.fixture
+def image():
+    return np.random.default_rng(0).integers(0, 3000, (20, 24)).astype(np.uint16)
+
+
+def test_depth_comes_back_from_every_format_as_it_was_stored(image, tmp_path):
+    Image.fromarray(image).save(tmp_path / "a.png")
+    np.save(tmp_path / "b.npy", image / np.float32(1000))
+    np.savez(tmp_path / "c.npz", image)
+    np.savez_compressed(tmp_path / "d.npz", depth=image, rgb=image)
+    np.testing.assert_array_equal(read_depth(tmp_path / "a.png"), image)
+    assert read_depth(tmp_path / "a.png").dtype.kind in "iu"
+    np.testing.assert_array_equal(read_depth(tmp_path / "b.npy"), image / np.float32(1000))
+    np.testing.assert_array_equal(read_depth(tmp_path / "c.npz"), image)
+    np.testing.assert_array_equal(read_depth(tmp_path / "d.npz"), image)
+
+
+def test_what_is_no_depth_image_is_refused(image, tmp_path):
+    Image.fromarray(image.astype(np.uint8)).save(tmp_path / "grey.png")
+    Image.fromarray(np.zeros((4, 4, 3), np.uint8)).save(tmp_path / "colour.png")
+    for name in ("grey", "colour"):
+        with pytest.raises(ValueError, match="expected a PNG of 16 bits with one channel"):
+            read_depth(tmp_path / f"{name}.png")
+    np.savez(tmp_path / "two.npz", a=image, b=image)
+    with pytest.raises(ValueError, match=r"one with the key 'depth' in .*got \['a', 'b'\]"):
+        read_depth(tmp_path / "two.npz")
+    (tmp_path / "depth.exr").write_bytes(b"")
+    with pytest.raises(ValueError, match=r"expected one of \.png, \.npy, \.npz"):
+        read_depth(tmp_path / "depth.exr")
+
+
+def test_a_missing_file_is_named(tmp_path):
+    for name, read in (
+        ("depth", read_depth),
+        ("camera", read_camera),
+        ("keypoints", read_keypoints),
+        ("mask", read_mask),
+    ):
+        with pytest.raises(FileNotFoundError, match=f"{name}: no file '.*nowhere.png'"):
+            read(tmp_path / "nowhere.png")
+
+
+@pytest.mark.parametrize("suffix", [".png", ".npy", ".npz"])
+def test_a_damaged_depth_image_is_refused(suffix, image, tmp_path):
+    path = tmp_path / f"depth{suffix}"
+    {".png": lambda: Image.fromarray(image).save(path), ".npy": lambda: np.save(path, image)}.get(
+        suffix, lambda: np.savez(path, image)
+    )()
+    whole = path.read_bytes()
+    for content in (whole[: len(whole) // 2], b"", b"no image"):
+        path.write_bytes(content)
+        with pytest.raises(ValueError, match="is damaged, cut off or of another format"):
+            read_depth(path)
+
+
+def with_random_damage(content, rng):
+    """Some bytes replaced, mostly in the headers at both ends; now and then cut off."""
+    damaged = bytearray(content)
+    for _ in range(rng.integers(1, 4)):
+        place = rng.integers(len(damaged) if rng.random() < 0.3 else 200)
+        damaged[place if rng.random() < 0.5 else -1 - place] = rng.integers(256)
+    return bytes(damaged[: rng.integers(len(damaged))] if rng.random() < 0.2 else damaged)
+
+
+@pytest.mark.filterwarnings("ignore")  # numpy compiles the header
+@pytest.mark.parametrize("name", ["depth.png", "depth.npy", "stored.npz", "compressed.npz"])
+def test_random_damage_gives_a_depth_image_or_a_value_error_that_names_it(name, image, tmp_path):
+    path = tmp_path / name
+    if name == "depth.png":
+        Image.fromarray(image).save(path)
+    elif name == "depth.npy":
+        np.save(path, image)
+    else:
+        (np.savez if name == "stored.npz" else np.savez_compressed)(path, depth=image)
+    whole, rng, messages = path.read_bytes(), np.random.default_rng(0), []
+    for _ in range(600):
+        path.write_bytes(with_random_damage(whole, rng))
+        try:
+            assert isinstance(read_depth(path), np.ndarray)
+        except ValueError as error:
+            messages.append(str(error))
+    assert len(messages) > 300
+    assert [message for message in messages if name not in message] == []
+
+
+def test_an_archive_of_something_else_than_an_array_is_refused(tmp_path):
+    with zipfile.ZipFile(tmp_path / "depth.npz", "w") as archive:
+        archive.writestr("depth", "no array")
+    with pytest.raises(ValueError, match=r"depth\.npz' is damaged.*no array"):
+        read_depth(tmp_path / "depth.npz")
+
+
+def test_a_png_that_says_to_be_enormous_is_refused(image, tmp_path):
+    Image.fromarray(image).save(tmp_path / "depth.png")
+    content = bytearray((tmp_path / "depth.png").read_bytes())
+    header = b"IHDR" + struct.pack(">II", 60000, 60000) + bytes(content[24:29])
+    content[12:33] = header + struct.pack(">I", zlib.crc32(header))
+    (tmp_path / "depth.png").write_bytes(content)
+    with pytest.raises(ValueError, match=r"depth\.png' is damaged"):
+        read_depth(tmp_path / "depth.png")
+
+
+def test_objects_in_an_array_file_are_never_loaded(tmp_path):
+    np.save(tmp_path / "objects.npy", np.array([{}], dtype=object), allow_pickle=True)
+    with pytest.raises(ValueError, match="of another format"):
+        read_depth(tmp_path / "objects.npy")
+
+
+@pytest.mark.parametrize("mode", ["1", "L", "P", "RGB", "RGBA"])
+def test_a_mask_of_any_kind_is_read(mode, tmp_path):
+    body = np.zeros((20, 24), bool)
+    body[5:9, 4:11] = True
+    Image.fromarray(255 * body.astype(np.uint8)).convert(mode).save(tmp_path / "mask.png")
+    np.testing.assert_array_equal(read_mask(tmp_path / "mask.png"), body)
+
+
+def test_cameras_are_read_from_yaml_and_json(tmp_path):
+    values = vars(CAMERA)
+    (tmp_path / "camera.json").write_text(json.dumps(values))
+    (tmp_path / "camera.yaml").write_text("\n".join(f"{key}: {value}" for key, value in values.items()))
+    assert read_camera(tmp_path / "camera.json") == CAMERA
+    assert read_camera(tmp_path / "camera.yaml") == CAMERA
+
+
+def test_a_camera_s_numbers_may_be_written_in_any_way(tmp_path):
+    (tmp_path / "camera.json").write_text(
+        '{"fx": 1.005e2, "fy": 101, "cx": "10", "cy": 9, "width": 24.0, "height": 20}'
+    )
+    assert read_camera(tmp_path / "camera.json") == CAMERA
+
+
+def test_the_training_camera_is_read_from_the_configuration(kinect):
+    assert read_camera("conf/data/camera/kinect_v2.yaml") == kinect
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("fx: 1\nfy: 1", "cx, cy, width, height are missing"),
+        (
+            "fx: 1\nfy: 1\ncx: 1\ncy: 1\nwidth: 9\nheight: 9\nk1: 0.1",
+            "k1 are unknown .there is no distortion",
+        ),
+        ("fx: [1]\nfy: 1\ncx: 1\ncy: 1\nwidth: 9\nheight: 9", r"fx: expected a finite number.*got \[1\]"),
+        ("fx: 1\nfy: wide\ncx: 1\ncy: 1\nwidth: 9\nheight: 9", "fy: expected a finite number.*got 'wide'"),
+        ("fx: 1\nfy: 1\ncx: null\ncy: 1\nwidth: 9\nheight: 9", "cx: expected a finite number.*got None"),
+        ("fx: 1\nfy: 1\ncx: 1\ncy: true\nwidth: 9\nheight: 9", "cy: expected a finite number.*got True"),
+        ("fx: 1\nfy: 1\ncx: 1\ncy: 1\nwidth: .inf\nheight: 9", "width: expected a finite number.*got inf"),
+        ("fx: 1\nfy: 1\ncx: 1\ncy: 1\nwidth: 4.9\nheight: 9", r"width: expected a whole number.*got 4\.9"),
+        ("fx: 1\nfy: 1\ncx: 1\ncy: 1\nwidth: 9\nheight: 8.5", r"height: expected a whole number.*got 8\.5"),
+        ("fx: 2001-99-99\nfy: 1", "is damaged"),
+        ("fx: 1\nfy: 1\ncx: 1\ncy: 8\nwidth: 9\nheight: 5", "principal point.*lies outside.*swapped"),
+        ("fx: {", "is damaged"),
+        ("- 3", "expected the keys"),
+    ],
+)
+def test_a_bad_camera_file_is_refused(text, message, tmp_path):
+    (tmp_path / "camera.yaml").write_text(text)
+    with pytest.raises(ValueError, match=message):
+        read_camera(tmp_path / "camera.yaml")
+
+
+def test_keypoints_that_are_no_json_are_refused(tmp_path):
+    for text in ("[[1, 2], [", 100_000 * "["):
+        (tmp_path / "keypoints.json").write_text(text)
+        with pytest.raises(ValueError, match=r"keypoints\.json' is damaged"):
+            read_keypoints(tmp_path / "keypoints.json")
+
+
+def test_arrays_come_back(pipeline, given, kinect, tmp_path):
+    found = pipeline(given[0], kinect, given[1])
+    write_arrays(tmp_path / "found.npz", found, kinect)
+    with np.load(tmp_path / "found.npz") as arrays:
+        assert set(arrays.files) == {*vars(found), "camera"}
+        for name, value in vars(found).items():
+            np.testing.assert_array_equal(arrays[name], value)
+        assert Camera(*arrays["camera"]) == kinect
+
+
+@pytest.mark.parametrize(("suffix", "axes"), [(".ply", [1, 1, 1]), (".glb", [1, -1, -1])])
+def test_meshes_come_back(suffix, axes, pipeline, given, kinect, tmp_path):
+    trimesh = pytest.importorskip("trimesh")
+    found = pipeline(given[0], kinect, given[1])
+    write_mesh(tmp_path / f"mesh{suffix}", found.vertices, found.faces)
+    mesh = trimesh.load(tmp_path / f"mesh{suffix}", process=False, force="mesh")
+    np.testing.assert_allclose(mesh.vertices, found.vertices * axes, atol=1e-6)
+    np.testing.assert_array_equal(mesh.faces, found.faces)

@@ -1,0 +1,182 @@
+import re
+
+import numpy as np
+import pytest
+import torch
+
+from ljn.body import SMPL
+from ljn.body.skeleton import ROOT
+from ljn.geometry.camera import Camera, project
+from ljn.geometry.rotations import CAMERA_FROM_BODY
+from ljn.pipeline.pipeline import CloudSettings, Pipeline, make_cloud
+from ljn.render import get_renderer
+
+
+def arrays(prediction):
+    return {name: value for name, value in vars(prediction).items() if value is not None}
+
+
+def assert_equal(first, second, atol=0.0):
+    assert arrays(first).keys() == arrays(second).keys()
+    for name, value in arrays(first).items():
+        np.testing.assert_allclose(value, arrays(second)[name], rtol=0, atol=atol, err_msg=name)
+
+
+def test_it_makes_the_inputs_of_training_and_predicts_what_evaluation_does(
+    samples, stages, pipeline, kinect, monkeypatch
+):
+    for index, (batch, depth) in enumerate(samples):
+        # The stream that the sample's own points were drawn from: seed, split, epoch, index, purpose.
+        monkeypatch.setattr("ljn.pipeline.pipeline._SEED", [7, 0, 0, index, 2])
+        found = pipeline(depth, kinect, batch["noisy_keypoints_2d"][0].numpy())
+        np.testing.assert_array_equal(found.points, batch["points"][0])
+        np.testing.assert_array_equal(found.initial_joints, batch["initial_joints"][0])
+        detector, regressor = (stage.module for stage in stages)
+        joints = detector.evaluate(batch, detector.test_metrics)["pred_joints"]
+        np.testing.assert_array_equal(found.joints, joints[0])
+        expected = regressor.evaluate({**batch, "initial_joints": joints}, regressor.test_metrics)
+        np.testing.assert_array_equal(found.vertices, expected["pred_vertices"][0])
+        np.testing.assert_array_equal(found.pose, expected["pred_pose"][0])
+        np.testing.assert_array_equal(found.betas, expected["pred_betas"][0])
+
+
+def test_the_mesh_of_pose_and_shape_is_placed_at_the_detected_root(pipeline, given, kinect):
+    found = pipeline(given[0], kinect, given[1])
+    body = SMPL.load()
+    vertices, joints = body(torch.from_numpy(found.pose), torch.from_numpy(found.betas))
+    turned = (vertices - joints[ROOT]) @ CAMERA_FROM_BODY.float().T
+    np.testing.assert_allclose(
+        found.vertices, (turned + torch.from_numpy(found.joints[ROOT])).numpy(), atol=1e-5
+    )
+    np.testing.assert_array_equal(found.faces, body.faces)
+
+
+def test_a_batch_gives_what_its_images_give_alone(pipeline, samples, kinect):
+    depth = np.stack([image for _, image in samples])
+    keypoints = [batch["noisy_keypoints_2d"][0].numpy() for batch, _ in samples]
+    together = pipeline(depth, kinect, keypoints)
+    assert together.vertices.shape == (3, 6890, 3)
+    for index in range(3):
+        assert_equal(together[index], pipeline(depth[index], kinect, keypoints[index]), atol=2e-6)
+
+
+def test_the_same_input_gives_the_same_output_whatever_was_drawn_before(pipeline, given, kinect):
+    first = pipeline(given[0], kinect, given[1])
+    torch.manual_seed(99)
+    np.random.default_rng().standard_normal(5)
+    assert_equal(pipeline(given[0], kinect, given[1]), first)
+
+
+def test_integer_millimetres_equal_metres(pipeline, given, kinect):
+    millimetres = (1000 * given[0]).round().astype(np.uint16)
+    assert_equal(pipeline(millimetres, kinect, given[1]), pipeline(millimetres / 1000, kinect, given[1]))
+
+
+def test_a_mask_equals_an_image_without_background(pipeline, given, kinect):
+    depth, keypoints = given
+    behind = np.where(depth > 0, depth, np.float32(4))
+    assert_equal(
+        pipeline(behind, kinect, keypoints, mask=255 * (depth > 0).astype(np.uint8)),
+        pipeline(depth, kinect, keypoints),
+    )
+
+
+def test_without_a_regressor_there_are_joints_alone(stages, given, kinect):
+    found = Pipeline(stages[0])(given[0], kinect, given[1])
+    assert found.joints.shape == (24, 3)
+    assert found.vertices is None
+    assert found.faces is None
+
+
+def test_each_stage_gets_the_cloud_of_its_own_training(stages, given, kinect):
+    other = stages[1]._replace(cloud=CloudSettings(64, "knn", stages[1].cloud.spacing_m))
+    observation = Pipeline(stages[0], other).observe(given[0], kinect, given[1])
+    assert observation.points.shape == (128, 6)
+    assert observation.mesh_points.shape == (64, 6)
+    np.testing.assert_array_equal(observation.points[:64, :3], observation.mesh_points[:, :3])
+    assert not np.array_equal(observation.points[:64, 3:], observation.mesh_points[:, 3:])
+
+
+def test_a_lying_camera_of_another_size_sees_the_same_person(pipeline, samples):
+    # The same body, rendered by a camera of other intrinsics and size: clouds of the same surface.
+    camera = Camera(fx=210.0, fy=212.0, cx=130.0, cy=90.0, width=256, height=192)
+    body = SMPL.load()
+    vertices, joints = body(torch.zeros(72), torch.zeros(10))
+    upright = torch.tensor([[1.0, 0, 0], [0, -1, 0], [0, 0, -1]])  # SMPL's rest frame to camera axes
+    place = torch.tensor([0.0, 0, 2.5])
+    vertices, joints = ((x - joints[ROOT]) @ upright.T + place for x in (vertices, joints))
+    depth = get_renderer("zbuffer")(vertices[None], body.faces, camera)[0].numpy()
+    keypoints = project(joints, camera.intrinsics()).numpy()
+    found = pipeline(depth, camera, keypoints)
+    assert np.abs(found.initial_joints[:, :2] - joints[:, :2].numpy()).max() < 0.15
+    assert found.points[:, 2].min() > 2.2
+    assert abs(found.points[:, 1].mean() - float(joints[:, 1].mean())) < 0.2
+
+
+def test_pixels_much_denser_than_in_training_are_thinned_to_patches_of_the_same_size(kinect):
+    step = 3
+    camera = Camera(
+        step * kinect.fx, step * kinect.fy, step * kinect.cx, step * kinect.cy, step * 424, step * 512
+    )
+    # A tilted plane 1.4 m away, seen by both cameras: z = 1.4 + 0.3 x.
+    images = []
+    for one in (kinect, camera):
+        v, u = np.mgrid[: one.height, : one.width]
+        x = (u - one.cx) / one.fx
+        depth = 1.4 / (1 - 0.3 * x)
+        images.append(
+            np.where((abs(x) < 0.13) & (abs(v - one.cy) < 0.13 * one.fy), depth, 0).astype(np.float32)
+        )
+    settings = CloudSettings(256, "window", 1.5 / kinect.fx)
+    coarse, fine = (make_cloud(image, one, settings) for image, one in zip(images, (kinect, camera)))
+    # The fine camera's every third pixel is the coarse camera's image.
+    np.testing.assert_allclose(fine, coarse, atol=2e-3)
+    np.testing.assert_allclose(fine[:, 3:] @ np.array([0.3, 0, -1]) / np.hypot(0.3, 1), 1, atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda d, k: (1000 * d, k), "depth: floats are metres, but the median is .*millimetres"),
+        (lambda d, k: (d.round().astype(np.uint16), k), "depth: integers are millimetres, but the median is"),
+        (lambda d, k: (d.T, k), "depth: expected the camera's 512 x 424.*transposed, or the camera's width"),
+        (lambda d, k: (d[:100], k), "depth: expected the camera's 512 x 424.*got 100 x 424.*scale its fx"),
+        (lambda d, k: (0 * d, k), "depth: all pixels are 0"),
+        (lambda d, k: (np.where(d > 0, d, np.nan), k), "depth: .* pixels are NaN.*nan_to_num"),
+        (lambda d, k: (-d, k), "depth: .* pixels are negative"),
+        (lambda d, k: (d > 0, k), "depth: expected float metres or integer millimetres, got bool"),
+        (lambda d, k: (np.where(d > 0, d, 5), k), "more than a person; give a mask of the person"),
+        (lambda d, k: (0.1 * d, k), "less than a person; is the depth in another unit"),
+        (lambda d, k: (d, k + 300), r"keypoints: \d+ of 24 lie outside the image of 424 x 512"),
+        (lambda d, k: (d, k / [424, 512]), "expected pixels, but all lie between 0 and 2.*multiply"),
+        (
+            lambda d, k: (d, k[:20]),
+            "keypoints: expected 24 .smpl24., 17 .coco17., 25 .body25. of them, got 20",
+        ),
+        (lambda d, k: (d, k * [0.2, 0.2]), "lie near the body"),
+        (
+            lambda d, k: (d, np.where(np.arange(24)[:, None] < 7, k, np.nan)),
+            "7 joints are known, expected at least 8",
+        ),
+    ],
+)
+def test_bad_input_is_an_error_that_says_how_to_mend_it(change, message, pipeline, given, kinect):
+    depth, keypoints = change(*given)
+    with pytest.raises(ValueError, match=f"(?s){message}"):
+        pipeline(depth, kinect, keypoints)
+
+
+def test_a_bad_mask_is_an_error(pipeline, given, kinect):
+    depth, keypoints = given
+    with pytest.raises(ValueError, match=r"mask: expected the camera's 512 x 424.*transposed"):
+        pipeline(depth, kinect, keypoints, mask=depth.T > 0)
+    with pytest.raises(ValueError, match="mask: no pixel of the mask has a depth"):
+        pipeline(depth, kinect, keypoints, mask=depth == 0)
+
+
+def test_an_error_in_a_batch_names_the_image(pipeline, given, kinect):
+    depth, keypoints = given
+    with pytest.raises(ValueError, match="image 1 of the batch: depth: all pixels are 0"):
+        pipeline(np.stack([depth, 0 * depth]), kinect, [keypoints, keypoints])
+    with pytest.raises(ValueError, match=re.escape("got 2 images, 1 keypoints and 2 masks")):
+        pipeline(np.stack([depth, depth]), kinect, [keypoints])
