@@ -2,8 +2,6 @@
 
 import numpy as np
 
-from ljn.geometry.camera import Camera
-
 JOINT_NOISES = ("planar", "isotropic")
 
 
@@ -25,21 +23,18 @@ def add_depth_noise(
     return noisy
 
 
-def add_keypoint_noise(
-    keypoints: np.ndarray, noise_px: float, camera: Camera | None, rng: np.random.Generator
-) -> np.ndarray:
-    """2D keypoints as a detector might give them.
+def add_keypoint_noise(keypoints: np.ndarray, noise_px: float, rng: np.random.Generator) -> np.ndarray:
+    """2D keypoints as a detector might give them; they may lie outside the image.
 
     Args:
         keypoints: `(K, 2)`, pixels.
         noise_px: Standard deviation of the Gaussian noise on u and on v, pixels.
-        camera: Its image clips the result; None does not clip.
         rng: Source of the draws; they do not depend on `noise_px`.
+
+    Returns:
+        `(K, 2)` float32.
     """
-    noisy = keypoints + noise_px * rng.standard_normal(keypoints.shape)
-    if camera is not None:
-        noisy = noisy.clip(0, [camera.width - 1, camera.height - 1])
-    return noisy.astype(np.float32)
+    return (keypoints + noise_px * rng.standard_normal(keypoints.shape)).astype(np.float32)
 
 
 def add_joint_noise(joints: np.ndarray, noise_m: float, kind: str, rng: np.random.Generator) -> np.ndarray:

@@ -1,7 +1,7 @@
 """From a pose record to a training sample: mesh, depth image, noisy cloud with normals, initial joints."""
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple, cast
@@ -14,9 +14,7 @@ from datamodules.noise import JOINT_NOISES, add_depth_noise, add_joint_noise, ad
 from datamodules.placement import HEADINGS, check_margin, draw_heading, place
 from datamodules.sources import PoseRecords
 from ljn.body import SMPL, BodyModel
-from ljn.cloud.lifting import lift_keypoints
-from ljn.cloud.normals import NORMALS, NormalEstimator, get_normal_estimator
-from ljn.cloud.sampling import sample_cloud
+from ljn.cloud.observation import ObservationRecipe, observe, stack_observations
 from ljn.data import Batch
 from ljn.geometry.camera import Camera, project
 from ljn.geometry.rotations import CAMERA_FROM_BODY, rotation_about, rotmat_to_rotvec, rotvec_to_rotmat
@@ -25,6 +23,8 @@ from ljn.render import RENDERERS, Renderer, get_renderer
 # Each purpose has a generator of its own: changing one (the number of points, a sigma) leaves the others' draws.
 _PLACEMENT, _DEPTH_NOISE, _SAMPLING, _KEYPOINTS, _JOINTS = range(5)
 
+SAMPLES_VERSION = 1
+"""Raised with every change of the samples made of the same records: results are comparable within a version only."""
 INITIAL_JOINTS = ("lifted", "noised")
 
 
@@ -33,8 +33,6 @@ class SynthesisSettings:
     """How a pose becomes a sample.
 
     Attributes:
-        camera: The depth camera.
-        num_points: Points in a cloud.
         heading: `histogram`, `uniform` or `source`; see `draw_heading`.
         distance_m: Range of the depth of the body's centre, metres.
         margin_px: Clear border around the body, pixels.
@@ -45,11 +43,8 @@ class SynthesisSettings:
         joint_noise_m: Standard deviation of the noise of `noised`, metres.
         joint_noise: Its directions: `planar` (the camera's x and y) or `isotropic`.
         renderer: A name that `ljn.render.get_renderer` knows.
-        normals: One of `ljn.cloud.normals.NORMALS`.
     """
 
-    camera: Camera
-    num_points: int
     heading: str = "histogram"
     distance_m: tuple[float, float] = (1.5, 3.0)
     margin_px: float = 8.0
@@ -59,40 +54,44 @@ class SynthesisSettings:
     joint_noise_m: float = 0.02
     joint_noise: str = "planar"
     renderer: str = "auto"
-    normals: str = "window"
 
     def __post_init__(self) -> None:
-        if self.num_points < 1:
-            raise ValueError(f"num_points: expected at least 1, got {self.num_points}")
         choices = {
             "heading": HEADINGS,
             "initial_joints": INITIAL_JOINTS,
             "joint_noise": JOINT_NOISES,
             "renderer": RENDERERS,
-            "normals": NORMALS,
         }
         for name, known in choices.items():
             if getattr(self, name) not in known:
                 raise ValueError(f"{name}: expected one of {', '.join(known)}, got '{getattr(self, name)}'")
-        check_margin(self.camera, self.margin_px)
+        if not isinstance(self.distance_m, Sequence) or len(self.distance_m) != 2:
+            raise ValueError(
+                f"distance_m: expected two numbers, nearest and farthest, got {self.distance_m!r}"
+            )
         if not 0 < self.distance_m[0] <= self.distance_m[1]:
             raise ValueError(f"distance_m: expected 0 < nearest <= farthest, got {self.distance_m}")
         for name in ("margin_px", "depth_noise_m", "keypoint_noise_px", "joint_noise_m"):
             value = getattr(self, name)
-            if not (math.isfinite(value) and value >= 0):
-                raise ValueError(f"{name}: expected a number of 0 or more, got {value}")
+            if not (isinstance(value, int | float) and math.isfinite(value) and value >= 0):
+                raise ValueError(f"{name}: expected a number of 0 or more, got {value!r}")
+            object.__setattr__(self, name, float(value))  # so that 10 and 10.0 make the same set of samples
+        object.__setattr__(self, "distance_m", tuple(map(float, self.distance_m)))
 
 
 class DepthSynthesizer:
     """Renders samples of a table of records; cheap to build and to send to a worker process.
 
-    The body layer, the renderer and the normal estimator are made on first use, in the process that uses them.
+    The body layer and the renderer are made on first use, in the process that uses them.
 
     Args:
         records: The poses and shapes.
         bodies: A body for each gender among the records.
+        camera: The depth camera.
         settings: See `SynthesisSettings`.
-        seed_key: What the random draws hang on, beside a sample's epoch and index: a seed and a split number.
+        recipe: How depth images are observed.
+        takes: What of an observation is made beside keypoints and initial joints: see `ljn.cloud.observation.PARTS`.
+        seed_key: What the random draws depend on, beside a sample's epoch and index: a seed and a split number.
         dtype: Precision of the body; float64 makes fixed sets agree across machines.
     """
 
@@ -100,7 +99,10 @@ class DepthSynthesizer:
         self,
         records: PoseRecords,
         bodies: Sequence[BodyModel],
+        camera: Camera,
         settings: SynthesisSettings,
+        recipe: ObservationRecipe,
+        takes: Collection[str],
         seed_key: tuple[int, int],
         dtype: torch.dtype = torch.float32,
     ) -> None:
@@ -108,14 +110,18 @@ class DepthSynthesizer:
             raise ValueError(
                 "heading: these poses carry no heading of their own; use 'histogram' or 'uniform'"
             )
+        check_margin(camera, settings.margin_px)
         self.records = records
         self.bodies = bodies
+        self.camera = camera
         self.settings = settings
+        self.recipe = recipe
+        self.takes = {*takes, "keypoints", "initial_joints"}
         self.seed_key = seed_key
         self.dtype = dtype
 
     def __getstate__(self) -> dict[str, Any]:
-        lazy = ("_smpl", "_renderer", "_normals")
+        lazy = ("_smpl", "_renderer")
         return {name: value for name, value in self.__dict__.items() if name not in lazy}
 
     @cached_property
@@ -125,10 +131,6 @@ class DepthSynthesizer:
     @cached_property
     def _renderer(self) -> Renderer:
         return get_renderer(self.settings.renderer)
-
-    @cached_property
-    def _normals(self) -> NormalEstimator:
-        return get_normal_estimator(self.settings.normals)
 
     def _rng(self, epoch: int, index: int, purpose: int) -> np.random.Generator:
         return np.random.default_rng([*self.seed_key, epoch, index, purpose])
@@ -148,7 +150,7 @@ class DepthSynthesizer:
     @torch.no_grad()
     def _render(self, keys: Sequence[tuple[int, int]]) -> "_Scene":
         """Pose the bodies, place them before the camera, take noisy depth images."""
-        settings, camera = self.settings, self.settings.camera
+        settings, camera = self.settings, self.camera
         placement = [self._rng(epoch, index, _PLACEMENT) for epoch, index in keys]
         rows = [index for _, index in keys]
         pose = torch.from_numpy(self.records.pose[rows]).to(self.dtype)
@@ -179,35 +181,28 @@ class DepthSynthesizer:
         return _Scene(pose, betas, gender, joints, depth)
 
     def _observe(self, keys: Sequence[tuple[int, int]], scene: "_Scene") -> Batch:
-        """Sample the depth images to clouds with normals; make the initial joints."""
-        settings, camera = self.settings, self.settings.camera
+        """Observe the depth images; add the truth."""
+        settings, camera = self.settings, self.camera
         intrinsics = camera.intrinsics(self.dtype).expand(len(keys), 4)
         keypoints = project(scene.joints, intrinsics).float()
-        points = np.empty((len(keys), settings.num_points, 6), np.float32)
-        noisy_keypoints = np.empty(keypoints.shape, np.float32)
-        initial_joints = np.empty(scene.joints.shape, np.float32)
+        observations = []
         for i, (epoch, index) in enumerate(keys):
-            depth = scene.depth[i]
-            cloud = sample_cloud(depth, camera, settings.num_points, self._rng(epoch, index, _SAMPLING))
-            points[i, :, :3] = cloud.points
-            points[i, :, 3:] = self._normals(cloud, depth, camera)
-            noisy_keypoints[i] = add_keypoint_noise(
-                keypoints[i].numpy(), settings.keypoint_noise_px, camera, self._rng(epoch, index, _KEYPOINTS)
+            noisy = add_keypoint_noise(
+                keypoints[i].numpy(), settings.keypoint_noise_px, self._rng(epoch, index, _KEYPOINTS)
             )
-            if settings.initial_joints == "lifted":
-                initial_joints[i] = lift_keypoints(noisy_keypoints[i], depth, camera)
-            else:
-                initial_joints[i] = add_joint_noise(
+            sampling = self._rng(epoch, index, _SAMPLING)
+            made = observe(scene.depth[i], camera, noisy, self.recipe, self.takes, sampling)
+            if settings.initial_joints == "noised":
+                made["initial_joints"] = add_joint_noise(
                     scene.joints[i].numpy(),
                     settings.joint_noise_m,
                     settings.joint_noise,
                     self._rng(epoch, index, _JOINTS),
                 )
+            observations.append(made)
         return Batch(
-            points=torch.from_numpy(points),
-            keypoints_2d=keypoints,
-            noisy_keypoints_2d=torch.from_numpy(noisy_keypoints),
-            initial_joints=torch.from_numpy(initial_joints),
+            **stack_observations(observations),  # type: ignore[typeddict-item]
+            true_keypoints=keypoints,
             joints=scene.joints.float(),
             pose=scene.pose.float(),
             betas=scene.betas.float(),

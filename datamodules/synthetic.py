@@ -3,6 +3,7 @@
 import hashlib
 import logging
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, cast
@@ -13,11 +14,13 @@ from torch.utils.data import BatchSampler, DataLoader, Dataset
 
 from datamodules.batches import EpochSampler, SharedBatches, fixed_batches
 from datamodules.cache import cached_samples
+from datamodules.placement import check_margin
 from datamodules.sources import PoseRecords, PoseSource
-from datamodules.synthesis import DepthSynthesizer, SynthesisSettings, concatenate
+from datamodules.synthesis import SAMPLES_VERSION, DepthSynthesizer, SynthesisSettings, concatenate
 from ljn.body import BodyModel, load_body_models
 from ljn.cloud.normals import get_normal_estimator
-from ljn.data import EMBEDDED_DATA_VERSION, SPLITS, Batch, BodyDataModule
+from ljn.cloud.observation import ObservationRecipe
+from ljn.data import SPLITS, Batch, BodyDataModule
 from ljn.geometry.camera import Camera
 from ljn.modules.joint_detector import JointDetector
 from ljn.render import get_renderer
@@ -37,7 +40,8 @@ class SyntheticDepthDataModule(BodyDataModule):
     Args:
         source: Where poses come from.
         camera: The depth camera.
-        num_points: Points in a cloud.
+        synthesis: How a pose becomes a sample.
+        observation: How its depth image is observed.
         num_train: Training samples in an epoch.
         num_val: Validation samples.
         num_test: Test samples.
@@ -48,28 +52,19 @@ class SyntheticDepthDataModule(BodyDataModule):
         cache_dir: Where the fixed sets are kept.
         body_path: SMPL-format file, or a folder of them; the embedded bodies by default. See
             `load_body_models`.
+        detector_ckpt: Checkpoint of a joint detector, whose joints then stand in place of the initial ones; it runs
+            on the training device.
         redraw_each_epoch: Whether headings, places, noise and points are drawn anew in every epoch.
         num_workers: Worker processes; 0 renders in the main process.
         prefetch_batches: Batches that each worker keeps ready.
-        heading: See `datamodules.placement.draw_heading`.
-        distance_m: Range of the depth of the body's centre, metres.
-        margin_px: Clear border around the body, pixels.
-        depth_noise_m: Standard deviation of the depth noise, metres.
-        keypoint_noise_px: Standard deviation of the keypoints' noise, pixels.
-        initial_joints: `lifted` and `noised`, see `SynthesisSettings`; or `detector`: what a trained joint
-            detector makes of the lifted ones, run on the training device.
-        joint_noise_m: See `SynthesisSettings`.
-        joint_noise: See `SynthesisSettings`.
-        detector_ckpt: The detector's checkpoint.
-        renderer: See `ljn.render.get_renderer`.
-        normals: See `ljn.cloud.normals.get_normal_estimator`.
     """
 
     def __init__(
         self,
         source: PoseSource,
         camera: Camera,
-        num_points: int,
+        synthesis: SynthesisSettings,
+        observation: ObservationRecipe,
         num_train: int,
         num_val: int,
         num_test: int,
@@ -79,41 +74,17 @@ class SyntheticDepthDataModule(BodyDataModule):
         eval_seed: int,
         cache_dir: str | Path,
         body_path: str | Path | None = None,
+        detector_ckpt: str | Path | None = None,
         redraw_each_epoch: bool = True,
         num_workers: int = 1,
         prefetch_batches: int = 4,
-        heading: str = "histogram",
-        distance_m: Sequence[float] = (1.5, 3.0),
-        margin_px: float = 8.0,
-        depth_noise_m: float = 0.001,
-        keypoint_noise_px: float = 10.0,
-        initial_joints: str = "lifted",
-        joint_noise_m: float = 0.02,
-        joint_noise: str = "planar",
-        detector_ckpt: str | Path | None = None,
-        renderer: str = "auto",
-        normals: str = "window",
     ) -> None:
         super().__init__()
-        self.settings = SynthesisSettings(
-            camera=camera,
-            num_points=num_points,
-            heading=heading,
-            distance_m=_pair("distance_m", distance_m),
-            margin_px=float(margin_px),
-            depth_noise_m=float(depth_noise_m),
-            keypoint_noise_px=float(keypoint_noise_px),
-            initial_joints="lifted" if initial_joints == "detector" else initial_joints,
-            joint_noise_m=float(joint_noise_m),
-            joint_noise=joint_noise,
-            renderer=renderer,
-            normals=normals,
-        )
-        if (initial_joints == "detector") != (detector_ckpt is not None):
-            raise ValueError(
-                f"initial_joints, detector_ckpt: expected a checkpoint for 'detector' and for nothing else, got "
-                f"'{initial_joints}' and {detector_ckpt}; use data.initial_joints=detector data.detector_ckpt=FILE"
-            )
+        check_margin(camera, synthesis.margin_px)
+        self.camera = camera
+        # A detector moves the lifted joints.
+        self.synthesis = replace(synthesis, initial_joints="lifted") if detector_ckpt else synthesis
+        self.observation = observation
         self.detector_ckpt = detector_ckpt
         self.source = source
         self.sizes = {"train": num_train, "val": num_val, "test": num_test}
@@ -142,6 +113,11 @@ class SyntheticDepthDataModule(BodyDataModule):
         return self._bodies
 
     @property
+    def recipe(self) -> ObservationRecipe:
+        """See `BodyDataModule`."""
+        return replace(self.observation, spacing_m=self.synthesis.distance_m[0] / self.camera.fx)
+
+    @property
     def fingerprint(self) -> str:
         """See `BodyDataModule`."""
         if self._detector_checkpoint is None:
@@ -152,7 +128,7 @@ class SyntheticDepthDataModule(BodyDataModule):
     @property
     def _samples_fingerprint(self) -> str:
         """Hash of what samples are made of before a detector sees them."""
-        made_of = f"{EMBEDDED_DATA_VERSION} {self.body_hash} {self.source.name} {self.source.fingerprint}"
+        made_of = f"{SAMPLES_VERSION} {self.body_hash} {self.source.name} {self.source.fingerprint}"
         return hashlib.sha256(made_of.encode()).hexdigest()[:16]
 
     @property
@@ -174,7 +150,8 @@ class SyntheticDepthDataModule(BodyDataModule):
         """See `BodyDataModule`."""
         return {
             "source": self.source.name,
-            "version": EMBEDDED_DATA_VERSION,
+            "version": SAMPLES_VERSION,
+            "source_version": self.source.version,
             "fingerprint": self.fingerprint,
             "licence": self.source.licence,
             "sizes": {split: self.sizes[split] for split in splits},
@@ -199,8 +176,8 @@ class SyntheticDepthDataModule(BodyDataModule):
                     f"{unknown[0]} is not among them; a model is only meaningful with its "
                     "bodies"
                 )
-        get_renderer(self.settings.renderer)
-        get_normal_estimator(self.settings.normals)
+        get_renderer(self.synthesis.renderer)
+        get_normal_estimator(self.observation.normals)
 
     @cached_property
     def _detector_checkpoint(self) -> tuple[JointDetector, Checkpoint] | None:
@@ -213,8 +190,8 @@ class SyntheticDepthDataModule(BodyDataModule):
         """Let the detector, where there is one, move the initial joints; on the device of the batch."""
         if self._detector_checkpoint is None:
             return batch
-        detector = self._detector_checkpoint[0].to(batch["points"].device)
-        return Batch(**{**batch, "initial_joints": detector(batch["points"], batch["initial_joints"])})
+        detector = self._detector_checkpoint[0].to(batch["initial_joints"].device)
+        return Batch(**{**batch, "initial_joints": detector(batch)})
 
     def setup(self, stage: str) -> None:
         """Build the sets that a stage (`fit`, `validate` or `test`) needs."""
@@ -224,6 +201,12 @@ class SyntheticDepthDataModule(BodyDataModule):
         for split in needed:
             if split not in self._fixed:
                 self._fixed[split] = FixedSamples(self._fixed_samples(split))
+
+    @property
+    def _observed(self) -> frozenset[str]:
+        """What is made of an observation: what the network takes, and the detector before it."""
+        detector = () if self._detector_checkpoint is None else self._detector_checkpoint[0].takes
+        return frozenset((*self.takes, *detector))
 
     def _records_of(self, split: str) -> PoseRecords:
         if split not in self._records:
@@ -235,7 +218,10 @@ class SyntheticDepthDataModule(BodyDataModule):
         return DepthSynthesizer(
             self._records_of(split),
             self.bodies,
-            self.settings,
+            self.camera,
+            self.synthesis,
+            self.observation,
+            self._observed,
             (self.seed if is_train else self.eval_seed, SPLITS.index(split)),
             torch.float32 if is_train else torch.float64,
         )
@@ -269,7 +255,8 @@ class SyntheticDepthDataModule(BodyDataModule):
     def fixed_key(self, split: str) -> str:
         """Hash of everything that a fixed set depends on; a detector works on it afterwards."""
         seeds = f"{self.pool_seed} {self.eval_seed}"
-        made_of = f"{self._samples_fingerprint} {split} {self.sizes[split]} {seeds} {self.settings}"
+        settings = f"{self.camera} {self.synthesis} {self.observation} {sorted(self._observed)}"
+        made_of = f"{self._samples_fingerprint} {split} {self.sizes[split]} {seeds} {settings}"
         return f"{split}-{hashlib.sha256(made_of.encode()).hexdigest()[:16]}"
 
     def _fixed_samples(self, split: str) -> dict[str, Tensor]:
@@ -286,7 +273,7 @@ class SyntheticDepthDataModule(BodyDataModule):
 
     @property
     def _uses_gl(self) -> bool:
-        return self.settings.renderer == "pyrender"
+        return self.synthesis.renderer == "pyrender"
 
     def _loader(self, samples: Dataset, batches: Any, persistent: bool = True) -> DataLoader:
         return DataLoader(
@@ -332,12 +319,6 @@ class FixedSamples(Dataset):
 
     def __getitems__(self, indices: list[int]) -> Batch:
         return cast(Batch, {name: value[indices] for name, value in self.samples.items()})
-
-
-def _pair(name: str, values: Sequence[float]) -> tuple[float, float]:
-    if not isinstance(values, Sequence) or len(values) != 2:
-        raise ValueError(f"{name}: expected two numbers, nearest and farthest, got {values!r}")
-    return float(values[0]), float(values[1])
 
 
 def _as_is(batch: Any) -> Any:

@@ -10,7 +10,9 @@ from typing import Any
 import hydra
 from omegaconf import DictConfig, OmegaConf
 
-OWN_MODULES = ("ljn.nets.", "ljn.modules.", "ljn.geometry.camera.", "datamodules.", "callbacks.")
+OWN_MODULES = (
+    "ljn.nets.", "ljn.modules.", "ljn.geometry.camera.", "ljn.cloud.observation.", "datamodules.", "callbacks.",
+)  # fmt: skip
 """Whose classes a config may name."""
 _FOREIGN_BASES = {
     "lightning.pytorch.": ("Trainer", "Callback", "loggers.Logger"),

@@ -8,23 +8,22 @@ from lightning.pytorch import LightningDataModule
 from torch import Tensor
 
 from ljn.body import BodyModel
-
-EMBEDDED_DATA_VERSION = 1
-"""Raised with every change of the embedded bodies, of the poses generated from the embedded clips, or of the samples
-made of them, because results are comparable within a version only. A test holds their hashes."""
+from ljn.cloud.observation import ObservationRecipe
 
 SPLITS = ("train", "val", "test")
 
 
-class Batch(TypedDict):
-    """A batch of samples; camera frame, metres and pixels.
+class Batch(TypedDict, total=False):
+    """A batch of samples: observations (see `Observation`; of its parts, those that the network takes) and the truth.
 
     Keys:
-        points: `(B, N, 6)` float32: position in metres and unit normal of each point, in random order.
-        keypoints_2d: `(B, 24, 2)`, true joints projected, pixels.
-        noisy_keypoints_2d: `(B, 24, 2)`, keypoints with noise, clipped to the image.
-        initial_joints: `(B, 24, 3)`, noisy keypoints lifted with the depth image, metres.
-        joints: `(B, 24, 3)`, true joints, metres.
+        points: `(B, N, 6)`.
+        crop: `(B, P, P)`.
+        crop_camera: `(B, 4)`.
+        keypoints: `(B, 24, 2)`, with noise.
+        initial_joints: `(B, 24, 3)`: keypoints lifted with the depth image, or what stands in their place.
+        true_keypoints: `(B, 24, 2)`, true joints projected, pixels.
+        joints: `(B, 24, 3)`, true joints, metres, camera frame.
         pose: `(B, 72)`, axis-angle in the body world, heading included, radians.
         betas: `(B, 10)`, shape coefficients.
         gender: `(B,)` int64, codes of `ljn.body.GENDERS`.
@@ -33,9 +32,11 @@ class Batch(TypedDict):
     """
 
     points: Tensor
-    keypoints_2d: Tensor
-    noisy_keypoints_2d: Tensor
+    crop: Tensor
+    crop_camera: Tensor
+    keypoints: Tensor
     initial_joints: Tensor
+    true_keypoints: Tensor
     joints: Tensor
     pose: Tensor
     betas: Tensor
@@ -45,16 +46,27 @@ class Batch(TypedDict):
 
 
 class BodyDataModule(LightningDataModule):
-    """Base of the data modules, whose loaders give `Batch`es: what tasks ask beside that."""
+    """Base of the data modules: what tasks ask of one beside its loaders.
+
+    Attributes:
+        takes: What of an observation the network takes, which the batches are to hold; set before `setup`.
+    """
+
+    takes: tuple[str, ...] = ("points", "initial_joints")
 
     @property
-    @abstractmethod
     def bodies(self) -> tuple[BodyModel, ...]:
-        """The bodies that the data shows, one for each gender."""
+        """The bodies that the data shows, one for each gender; none where it shows no body of SMPL's form."""
+        return ()
+
+    @property
+    def recipe(self) -> ObservationRecipe | None:
+        """How its observations are made, and what was trained with them: goes into checkpoints."""
+        return None
 
     @property
     def body_hash(self) -> str:
-        """The bodies' sorted hashes, joined by "-": see `SMPL.hash`."""
+        """The bodies' sorted hashes, joined by "-": see `SMPL.hash`; empty without bodies."""
         return "-".join(sorted(body.hash for body in self.bodies))
 
     @property

@@ -215,8 +215,8 @@ def draw_examples(batch: "Batch", depth: Tensor) -> "Figure":
         first.imshow(np.where(body, image, np.nan), cmap="viridis")
         first.set_axis_on()
         first.set(xticks=[], yticks=[])
-        first.scatter(*arrays["keypoints_2d"][number].T, s=5, c=_TRUE)
-        first.scatter(*arrays["noisy_keypoints_2d"][number].T, s=5, c=_PREDICTED)
+        first.scatter(*arrays["true_keypoints"][number].T, s=5, c=_TRUE)
+        first.scatter(*arrays["keypoints"][number].T, s=5, c=_PREDICTED)
         first.set_title(
             f"sample {arrays['sample_id'][number]}: {image[body].min():.2f} m away", fontsize=9, loc="left"
         )

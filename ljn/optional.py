@@ -16,7 +16,7 @@ def import_open3d() -> Any:
         raise ImportError(
             f"Open3D cannot be loaded ({error}). Install it with `pip install -e '.[open3d]'` and the system "
             "libraries libusb-1.0-0, libegl1 and libgl1; or do without it: "
-            "data.normals=knn (the same normals) or window, data.renderer=zbuffer"
+            "data.observation.normals=knn (the same normals) or window, data.synthesis.renderer=zbuffer"
         ) from error
     return open3d
 
@@ -35,6 +35,6 @@ def import_pyrender() -> Any:
     except (ImportError, OSError, AttributeError) as error:
         raise ImportError(
             f"pyrender cannot be loaded ({error}). Install it with `pip install -e '.[pyrender]'` and the system "
-            "libraries libegl1, libgl1 and libxrender1; or do without it: data.renderer=zbuffer"
+            "libraries libegl1, libgl1 and libxrender1; or do without it: data.synthesis.renderer=zbuffer"
         ) from error
     return pyrender

@@ -1,3 +1,4 @@
+import dataclasses
 import itertools
 import os
 from pathlib import Path
@@ -9,9 +10,11 @@ from hydra import compose, initialize_config_dir
 
 from datamodules.placement import draw_heading
 from datamodules.sources.embedded import EmbeddedSource
+from datamodules.synthesis import SynthesisSettings
 from datamodules.synthetic import SyntheticDepthDataModule
 from ljn.body import SMPL, load_body_model, load_body_models
 from ljn.body.kinematics import joint_offsets
+from ljn.cloud.observation import ObservationRecipe
 from ljn.geometry.camera import Camera
 from ljn.geometry.rotations import CAMERA_FROM_BODY, rotation_about, rotmat_to_rotvec, rotvec_to_rotmat
 from ljn.optional import import_open3d, import_pyrender
@@ -80,7 +83,10 @@ def bodies(body_models, source):
 
 @pytest.fixture(scope="session")
 def make_datamodule(kinect, body_models, source, tmp_path_factory):
-    """Builds a small data module; each with a cache of its own unless `cache_dir` is given."""
+    """Builds a small data module; each with a cache of its own unless `cache_dir` is given.
+
+    Fields of the settings objects are given flat.
+    """
     numbers = itertools.count()
 
     def make(**changes):
@@ -99,7 +105,11 @@ def make_datamodule(kinect, body_models, source, tmp_path_factory):
         }
         if "cache_dir" not in changes:
             arguments["cache_dir"] = tmp_path_factory.mktemp(f"samples{next(numbers)}")
-        datamodule = SyntheticDepthDataModule(**{**arguments, **changes})
+        given = {**arguments, **changes}
+        for name, settings in {"synthesis": SynthesisSettings, "observation": ObservationRecipe}.items():
+            keys = given.keys() & {field.name for field in dataclasses.fields(settings)}
+            given[name] = settings(**{key: given.pop(key) for key in keys})
+        datamodule = SyntheticDepthDataModule(**given)
         if "body_path" not in changes:
             datamodule._bodies = body_models  # read once for all
         return datamodule

@@ -1,6 +1,6 @@
 """The embedded data do not change by accident: results are comparable within one version of them only.
 
-Whoever changes them on purpose raises `ljn.data.EMBEDDED_DATA_VERSION` and writes the new values here
+Whoever changes them on purpose raises `POSES_VERSION` or `SAMPLES_VERSION` and writes the new values here
 (`python -m tests.test_frozen` prints them).
 """
 
@@ -8,14 +8,17 @@ import pytest
 import torch
 
 from datamodules.sources.embedded import EmbeddedSource
-from datamodules.synthesis import DepthSynthesizer, SynthesisSettings
+from datamodules.sources.embedded.records import POSES_VERSION
+from datamodules.synthesis import SAMPLES_VERSION, DepthSynthesizer, SynthesisSettings
 from ljn.body import GENDERS, load_body_models
-from ljn.data import EMBEDDED_DATA_VERSION, SPLITS
+from ljn.cloud.observation import ObservationRecipe
+from ljn.data import SPLITS
 from ljn.geometry.camera import Camera
 
 KINECT = Camera(fx=366.458, fy=366.736, cx=206.470, cy=253.026, width=424, height=512)
+VERSIONS = (POSES_VERSION, SAMPLES_VERSION)
 FROZEN = {
-    1: {
+    (1, 1): {
         "bodies": {"female": "6748ab1ac924a90f", "male": "ab7ff6d1c3d77b1b", "neutral": "f8442be8982ecbab"},
         "poses": {"train": "8a86d969da26eea5", "val": "f3f110654db84b59", "test": "5425c9021a580d85"},
         "samples": [
@@ -43,7 +46,10 @@ def samples():
     synthesizer = DepthSynthesizer(
         source.records("test", 4, seed=0),
         load_body_models(None, source.genders),
-        SynthesisSettings(KINECT, num_points=1024),
+        KINECT,
+        SynthesisSettings(),
+        ObservationRecipe(num_points=1024),
+        ("points",),
         (0, SPLITS.index("test")),
         torch.float64,
     )
@@ -54,8 +60,8 @@ def samples():
 
 @pytest.fixture(scope="module")
 def frozen():
-    assert EMBEDDED_DATA_VERSION in FROZEN, "a new version: write its values here"
-    return FROZEN[EMBEDDED_DATA_VERSION]
+    assert VERSIONS in FROZEN, "a new version: write its values here"
+    return FROZEN[VERSIONS]
 
 
 def test_the_bodies_are_those_of_this_version(frozen):
@@ -71,4 +77,4 @@ def test_the_samples_are_those_of_this_version(frozen):
 
 
 if __name__ == "__main__":
-    print({EMBEDDED_DATA_VERSION: {"bodies": bodies(), "poses": poses(), "samples": samples()}})
+    print({VERSIONS: {"bodies": bodies(), "poses": poses(), "samples": samples()}})

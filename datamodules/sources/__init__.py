@@ -81,6 +81,11 @@ class PoseSource(Protocol):
         ...
 
     @property
+    def version(self) -> int:
+        """Raised with every change of the records that its code makes of the same files."""
+        ...
+
+    @property
     def fingerprint(self) -> str:
         """Hash of all that its records depend on beside the seed: files, splits, settings."""
         ...

@@ -173,8 +173,8 @@ class JointMetrics(MetricCollection):
         pred_joints: Tensor,
         joints: Tensor,
         initial_joints: Tensor,
-        noisy_keypoints_2d: Tensor,
-        keypoints_2d: Tensor,
+        keypoints: Tensor,
+        true_keypoints: Tensor,
     ) -> None:
         """Add a batch.
 
@@ -182,15 +182,14 @@ class JointMetrics(MetricCollection):
             pred_joints: `(B, 24, 3)`, metres, camera frame.
             joints: `(B, 24, 3)`, metres, camera frame, the truth.
             initial_joints: `(B, 24, 3)`, metres, camera frame.
-            noisy_keypoints_2d: `(B, 24, 2)`, pixels.
-            keypoints_2d: `(B, 24, 2)`, pixels, the truth.
+            keypoints: `(B, 24, 2)`, pixels.
+            true_keypoints: `(B, 24, 2)`, pixels, the truth.
         """
-        keypoints = (noisy_keypoints_2d, keypoints_2d)
         others: dict[str, tuple[Tensor, ...]] = {
             "pckh_threshold_mm": (joints,),
             "initial_mpjpe": (initial_joints, joints),
-            "initial_mean_distance_px": keypoints,
-            "initial_max_distance_px": keypoints,
+            "initial_mean_distance_px": (keypoints, true_keypoints),
+            "initial_max_distance_px": (keypoints, true_keypoints),
         }
         for key, metric in self.items(keep_base=True):
             metric.update(*others.get(key, (pred_joints, joints)))

@@ -1,7 +1,7 @@
 """What the two stages' LightningModules share: optimizer wiring, the check of the loss, logging of metrics."""
 
 from abc import abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, ClassVar
 
 import torch
@@ -29,7 +29,7 @@ class StageModule(LightningModule):
 
     metrics: ClassVar[Callable[..., MetricCollection]]
     """Makes a split's metrics; its keys are what may be monitored."""
-    takes: ClassVar[type[nn.Module]]
+    net_type: ClassVar[type[nn.Module]]
     """What `net` must be."""
 
     def __init__(
@@ -39,16 +39,25 @@ class StageModule(LightningModule):
         scheduler: Callable[[Optimizer], LRScheduler] | None = None,
     ) -> None:
         super().__init__()
-        if not isinstance(net, self.takes):
+        if not isinstance(net, self.net_type):
             raise ValueError(
-                f"net: a {type(self).__name__} takes a {self.takes.__name__}, got a {type(net).__name__}; choose the "
-                "model and the module of one stage (experiment=..., or module=joint_detector, mesh_regressor)"
+                f"net: a {type(self).__name__} takes a {self.net_type.__name__}, got a {type(net).__name__}; choose "
+                "the model and the module of one stage (experiment=..., or module=joint_detector, mesh_regressor)"
             )
         self.net = net
         self._make_optimizer = optimizer
         self._make_scheduler = scheduler
         self.val_metrics = type(self).metrics(prefix="val/")
         self.test_metrics = type(self).metrics(prefix="test/")
+
+    @property
+    def takes(self) -> tuple[str, ...]:
+        """What of an observation the network takes: keys of a batch, in the order of its arguments."""
+        return self.net.takes  # type: ignore[return-value]
+
+    def forward(self, batch: Mapping[str, Tensor]) -> Any:
+        """What the network makes of a batch, of which it takes `takes`."""
+        return self.net(*(batch[name] for name in self.takes))
 
     @property
     def body_hashes(self) -> tuple[str, ...]:

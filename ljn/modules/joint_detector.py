@@ -17,26 +17,22 @@ class JointDetector(StageModule):
     """A joint detector (`net`: a `Detector`) with its loss (Eq. 3.6), optimizer and metrics; see `StageModule`."""
 
     metrics = JointMetrics
-    takes: ClassVar[type[nn.Module]] = Detector
+    net_type: ClassVar[type[nn.Module]] = Detector
     net: Detector
-
-    def forward(self, points: Tensor, initial_joints: Tensor) -> Tensor:
-        """Joints `(B, 24, 3)` from a cloud `(B, N, 6)` and initial joints `(B, 24, 3)`; metres, camera frame."""
-        return self.net(points, initial_joints)
 
     def loss(self, batch: Batch) -> Tensor:
         """See `StageModule.loss`."""
-        return joint_loss(self(batch["points"], batch["initial_joints"]), batch["joints"])
+        return joint_loss(self(batch), batch["joints"])
 
     def evaluate(self, batch: Batch, metrics: Any) -> dict[str, Tensor]:
         """See `StageModule.evaluate`; gives `pred_joints` `(B, 24, 3)`."""
-        pred_joints = self(batch["points"], batch["initial_joints"])
+        pred_joints = self(batch)
         metrics.update(
             pred_joints=pred_joints,
             joints=batch["joints"],
             initial_joints=batch["initial_joints"],
-            noisy_keypoints_2d=batch["noisy_keypoints_2d"],
-            keypoints_2d=batch["keypoints_2d"],
+            keypoints=batch["keypoints"],
+            true_keypoints=batch["true_keypoints"],
         )
         return {"pred_joints": pred_joints}
 
@@ -48,7 +44,7 @@ class YardstickDetector(JointDetector):
         net: The yardstick.
     """
 
-    takes = Yardstick
+    net_type = Yardstick
     net: Yardstick
 
     def __init__(self, net: Yardstick) -> None:

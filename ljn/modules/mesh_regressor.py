@@ -17,7 +17,7 @@ from ljn.geometry.rotations import rotmat_to_rotvec
 from ljn.losses import mesh_loss
 from ljn.metrics import MeshMetrics, apve
 from ljn.modules.base import StageModule
-from ljn.nets.body_network import BodyEstimate, BodyNetwork
+from ljn.nets.body_network import BodyNetwork
 
 
 class MeshRegressor(StageModule):
@@ -36,7 +36,7 @@ class MeshRegressor(StageModule):
     """
 
     metrics = MeshMetrics
-    takes = BodyNetwork
+    net_type = BodyNetwork
     net: BodyNetwork
 
     def __init__(
@@ -57,10 +57,6 @@ class MeshRegressor(StageModule):
         """See `StageModule.body_hashes`."""
         return (self.body.hash,)
 
-    def forward(self, points: Tensor, initial_joints: Tensor) -> BodyEstimate:
-        """Pose and shape after each iteration; see `BodyNetwork.forward`."""
-        return self.net(points, initial_joints)
-
     def target(self, batch: Batch) -> tuple[Tensor, Tensor]:
         """True vertices `(B, V, 3)` and joints `(B, 24, 3)`, metres, body frame."""
         with torch.no_grad():
@@ -68,7 +64,7 @@ class MeshRegressor(StageModule):
 
     def loss(self, batch: Batch) -> Tensor:
         """See `StageModule.loss`."""
-        rotmats, betas = self(batch["points"], batch["initial_joints"])
+        rotmats, betas = self(batch)
         return mesh_loss(self.body.from_rotmats(rotmats, betas).vertices, self.target(batch)[0])
 
     def evaluate(self, batch: Batch, metrics: Any) -> dict[str, Tensor]:
@@ -78,7 +74,7 @@ class MeshRegressor(StageModule):
         (the truth), in the camera frame, metres, the prediction placed at the initial root (Eq. 4.2);
         `pred_pose` `(B, 72)` and `pred_betas` `(B, 10)`; and each sample's `apve` `(B,)`, mm, body frame.
         """
-        rotmats, betas = (values[-1] for values in self(batch["points"], batch["initial_joints"]))
+        rotmats, betas = (values[-1] for values in self(batch))
         pred_vertices, pred_joints = self.body.from_rotmats(rotmats, betas)
         vertices, joints = self.target(batch)
         metrics.update(

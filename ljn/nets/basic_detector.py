@@ -6,12 +6,12 @@ import torch
 from torch import Tensor
 
 from ljn.body.skeleton import NUM_JOINTS
-from ljn.nets.detector import Detector
+from ljn.nets.detector import CloudDetector
 from ljn.nets.layers import perceptron
 from ljn.nets.pointnet import PointNet
 
 
-class BasicDetector(Detector):
+class BasicDetector(CloudDetector):
     """Every point carries the 72 initial coordinates; a PointNet regresses 72 outputs.
 
     Args:
@@ -19,7 +19,7 @@ class BasicDetector(Detector):
         local_channels: First widths of the shared perceptron.
         global_channels: Its other widths, up to the global feature.
         head_channels: Hidden widths of the head.
-        output: See `Detector`.
+        output: See `CloudDetector`.
     """
 
     def __init__(
@@ -35,7 +35,7 @@ class BasicDetector(Detector):
         self.head = perceptron([global_channels[-1], *head_channels, 3 * NUM_JOINTS], last_activation=False)
 
     def regress(self, points: Tensor, initial_joints: Tensor) -> Tensor:
-        """See `Detector.regress`."""
+        """See `CloudDetector.regress`."""
         coordinates = initial_joints.flatten(1)[:, None].expand(-1, points.shape[1], -1)
         features = self.trunk(torch.cat([points, coordinates], -1))
         return self.head(features.pooled).unflatten(-1, (NUM_JOINTS, 3))

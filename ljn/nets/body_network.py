@@ -44,6 +44,8 @@ class BodyNetwork(nn.Module, ABC):
         head_channels: Hidden widths of the initial estimate's head.
     """
 
+    takes = ("points", "initial_joints")
+
     def __init__(
         self,
         trunk: PointNet | PointNet2,

@@ -1,6 +1,7 @@
 """What every joint detector shares: the centred frame and the meaning of the output."""
 
 from abc import ABC, abstractmethod
+from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -14,19 +15,28 @@ def cloud_centre(points: Tensor) -> Tensor:
 
 
 class Detector(nn.Module, ABC):
-    """Base of the joint detectors: cloud and initial joints in, joints out, all in the camera frame.
+    """Base of the joint detectors: an observation in, joints `(B, 24, 3)` out; metres, camera frame.
+
+    Attributes:
+        takes: What of an observation it is called with: keys of a batch, in the order of its arguments.
+        is_root_relative: Whether only its joints' positions beside the root mean something.
+    """
+
+    takes: ClassVar[tuple[str, ...]]
+    is_root_relative: ClassVar[bool] = False
+
+
+class CloudDetector(Detector):
+    """Base of the detectors that take a cloud and initial joints.
 
     Everything is centred on the cloud's mean first, so a detector does not see where the person stands.
     Subclasses implement `regress` in that frame.
-
-    Attributes:
-        is_root_relative: Whether only its joints' positions beside the root mean something.
 
     Args:
         output: `offset`: `regress` gives offsets to the initial joints; `absolute`: positions.
     """
 
-    is_root_relative = False
+    takes = ("points", "initial_joints")
 
     def __init__(self, output: str = "offset") -> None:
         super().__init__()

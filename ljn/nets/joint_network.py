@@ -7,12 +7,12 @@ from torch import Tensor
 
 from ljn.body.skeleton import NUM_JOINTS
 from ljn.geometry.points import ball_group, distance_matrix, gather_points
-from ljn.nets.detector import Detector
+from ljn.nets.detector import CloudDetector
 from ljn.nets.layers import StackedLinear, StackedPReLU, activate_and_pool, stacked_perceptron
 from ljn.nets.pointnet import PointNet
 
 
-class LocalJointNetwork(Detector):
+class LocalJointNetwork(CloudDetector):
     """The proposed joint detector.
 
     For joint i: `group_size` points within `radii_m[i]` of its initial position; each brings its position
@@ -30,7 +30,7 @@ class LocalJointNetwork(Detector):
         global_channels: Trunk widths from there to the global feature.
         group_channels: Widths of a sub-network's shared perceptron, before its max pool.
         head_channels: Hidden widths of a sub-network's head.
-        output: See `Detector`.
+        output: See `CloudDetector`.
 
     Raises:
         ValueError: `radii_m` does not hold 24 positive numbers.
@@ -74,7 +74,7 @@ class LocalJointNetwork(Detector):
         )
 
     def regress(self, points: Tensor, initial_joints: Tensor) -> Tensor:
-        """See `Detector.regress`."""
+        """See `CloudDetector.regress`."""
         batch = len(points)
         local, pooled = self.trunk(points)
         index = ball_group(points[..., :3], initial_joints, self.radii, self.group_size)  # (B, K, n)

@@ -21,10 +21,11 @@ class SimpleBaseline(Detector):
         dropout: Share of the hidden values that are dropped in training.
     """
 
+    takes = ("initial_joints",)
     is_root_relative = True
 
     def __init__(self, channels: int = 1024, num_blocks: int = 2, dropout: float = 0.5) -> None:
-        super().__init__(output="offset")
+        super().__init__()
 
         def layer(fan_in: int) -> list[nn.Module]:
             return [nn.Linear(fan_in, channels), nn.BatchNorm1d(channels), nn.ReLU(), nn.Dropout(dropout)]
@@ -35,16 +36,12 @@ class SimpleBaseline(Detector):
         )
         self.last = nn.Linear(channels, 3 * NUM_JOINTS)
 
-    def forward(self, points: Tensor, initial_joints: Tensor) -> Tensor:
-        """See `Detector.forward`; `points` are not looked at."""
-        return self.regress(points, initial_joints) + initial_joints[:, ROOT, None]
-
-    def regress(self, points: Tensor, initial_joints: Tensor) -> Tensor:
-        """Joints relative to the root, `(B, 24, 3)`, metres, from initial joints in the camera frame."""
+    def forward(self, initial_joints: Tensor) -> Tensor:
+        """Joints from initial joints, both `(B, 24, 3)`, metres, camera frame; the root stays where it is."""
         rays = initial_joints[..., :2] / initial_joints[..., 2:]
         # The root's ray itself, the others relative to it.
         rays = torch.cat([rays[:, :1], rays[:, 1:] - rays[:, :1]], 1)
         hidden = self.first(rays.flatten(1))
         for block in self.blocks:
             hidden = hidden + block(hidden)
-        return self.last(hidden).unflatten(-1, (NUM_JOINTS, 3))
+        return self.last(hidden).unflatten(-1, (NUM_JOINTS, 3)) + initial_joints[:, ROOT, None]

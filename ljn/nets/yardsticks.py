@@ -10,12 +10,12 @@ import torch
 from torch import Tensor
 
 from ljn.body.skeleton import NUM_JOINTS
-from ljn.nets.detector import Detector, cloud_centre
+from ljn.nets.detector import CloudDetector, cloud_centre
 
 _SIZE = 3 * NUM_JOINTS
 
 
-class Yardstick(Detector):
+class Yardstick(CloudDetector):
     """Affine regression from the centred initial joints (72) to the joints' offsets (72)."""
 
     def __init__(self) -> None:
@@ -42,7 +42,7 @@ class Yardstick(Detector):
         """Fit the weights to what was accumulated."""
 
     def regress(self, points: Tensor, initial_joints: Tensor) -> Tensor:
-        """See `Detector.regress`."""
+        """See `CloudDetector.regress`."""
         offset = initial_joints.flatten(1).double() @ self.weight + self.bias
         return offset.to(initial_joints.dtype).unflatten(-1, (NUM_JOINTS, 3))
 

@@ -9,9 +9,7 @@ import numpy as np
 import torch
 
 from ljn.body.skeleton import ROOT
-from ljn.cloud.lifting import lift_keypoints
-from ljn.cloud.normals import get_normal_estimator
-from ljn.cloud.sampling import sample_cloud
+from ljn.cloud.observation import Observation, ObservationRecipe, observe, stack_observations
 from ljn.geometry.camera import Camera, place_at_root
 from ljn.geometry.rotations import rotmat_to_rotvec
 from ljn.modules.joint_detector import JointDetector
@@ -61,65 +59,44 @@ class Prediction:
         return type(self)(**chosen)
 
 
-class Observation(NamedTuple):
-    """What the networks take of one image.
-
-    Attributes:
-        points: `(N, 6)` float32, position (metres, camera frame) and normal: the joint detector's cloud.
-        mesh_points: `(M, 6)`, the mesh regressor's.
-        initial_joints: `(24, 3)`, metres, camera frame.
-        keypoints: See `Prediction`.
-        confidences: See `Prediction`.
-    """
-
-    points: np.ndarray
-    mesh_points: np.ndarray
-    initial_joints: np.ndarray
-    keypoints: np.ndarray
-    confidences: np.ndarray
-
-
-@dataclass(frozen=True)
-class CloudSettings:
-    """How a stage's clouds were made in training.
-
-    Attributes:
-        num_points: Points in a cloud.
-        normals: See `ljn.cloud.normals.get_normal_estimator`.
-        spacing_m: The least distance between the points of neighbouring pixels, metres: of the nearest bodies.
-    """
-
-    num_points: int
-    normals: str
-    spacing_m: float
-
-
 class Stage(NamedTuple):
-    """A trained module, how its clouds are made, and where it comes from.
+    """A trained module, how its observations are made, and where it comes from.
 
     Attributes:
         module: A `JointDetector` or a `MeshRegressor`.
-        cloud: See `CloudSettings`.
+        recipe: How the observations of its training were made.
         origin: Path, hash, run and epoch of its checkpoint: for records.
     """
 
     module: Any
-    cloud: CloudSettings
+    recipe: ObservationRecipe
     origin: dict[str, Any]
+
+
+class ObservedFrame(NamedTuple):
+    """One image as the stages take it.
+
+    Attributes:
+        depth: `(H, W)` float32, metres; 0 is background.
+        detector: The joint detector's observation, with a cloud in any case.
+        regressor: The mesh regressor's; None without one.
+        confidences: See `Prediction`.
+    """
+
+    depth: np.ndarray
+    detector: Observation
+    regressor: Observation | None
+    confidences: np.ndarray
 
 
 class Pipeline:
     """Finds a person's joints and mesh in a depth image, given the person's 2D keypoints.
 
-    Clouds are made as in training: back-projected random pixels with the number of points and the normals that each
-    checkpoint's configuration names.
+    Each stage's observation is made as in its training, by the recipe that its checkpoint carries.
 
-    Any camera and image size will do. Normals from a window of the depth image cover a patch of the body whose size
-    follows from the pixels' spacing in space, depth over focal length. Where that is less than half of the nearest
-    training bodies' (a focal length of twice the training camera's 366 px, or a person twice as near), every second
-    pixel, or third, or so on, is used, which brings patches and sensor noise back to what was trained. Where it is
-    more (a small time-of-flight camera, or a distance of over 3 m), nothing can be done: patches are larger, and
-    normals smoother, than any in training.
+    Any camera and image size will do: images much denser than those of the training are thinned (see `observe`). Of
+    coarser ones (a small time-of-flight camera, or a distance of over 3 m) the patches that normals are fitted to are
+    larger, and the normals smoother, than any in training.
 
     Args:
         detector: The joint detector.
@@ -199,34 +176,39 @@ class Pipeline:
                 raise ValueError(f"image {number} of the batch: {error}") from error
         return self.predict(observations)
 
-    def observe(self, depth: Any, camera: Camera, keypoints: Any, mask: Any = None) -> Observation:
-        """Check one image's input and make the clouds and initial joints; arguments as in a call."""
+    def observe(self, depth: Any, camera: Camera, keypoints: Any, mask: Any = None) -> ObservedFrame:
+        """Check one image's input and observe it for each stage; arguments as in a call."""
         metres = body_depth(depth, camera, mask)
-        found = smpl_keypoints(keypoints)
-        check_place(found, metres, camera)
-        # As in training, where noise may carry keypoints beyond the image.
-        positions = found.positions.clip(0, np.array([camera.width - 1, camera.height - 1], np.float32))
-        points = mesh_points = make_cloud(metres, camera, self.detector.cloud)
-        if self.regressor is not None and self.regressor.cloud != self.detector.cloud:
-            mesh_points = make_cloud(metres, camera, self.regressor.cloud)
-        initial_joints = lift_keypoints(positions, metres, camera)
-        return Observation(points, mesh_points, initial_joints, positions, found.confidences)
+        named = smpl_keypoints(keypoints)
+        check_place(named, metres, camera)
+
+        def observed(stage: Stage, *more: str) -> Observation:
+            rng = np.random.default_rng(_SEED)
+            takes = {*stage.module.takes, *more}
+            return observe(metres, camera, named.positions, stage.recipe, takes, rng)
+
+        return ObservedFrame(
+            metres,
+            observed(self.detector, "points", "initial_joints"),
+            observed(self.regressor) if self.regressor else None,
+            named.confidences,
+        )
 
     @torch.inference_mode()
-    def predict(self, observations: Sequence[Observation]) -> Prediction:
-        """Run the networks on a batch of at least one observation."""
-        batch = Observation(*map(np.stack, zip(*observations)))
+    def predict(self, frames: Sequence[ObservedFrame]) -> Prediction:
+        """Run the networks on a batch of at least one frame."""
         detector = self.detector.module
-        points, mesh_points, initial_joints = (
-            torch.from_numpy(values).to(detector.device)
-            for values in (batch.points, batch.mesh_points, batch.initial_joints)
-        )
-        joints = detector(points, initial_joints)
-        inputs = (batch.initial_joints, batch.keypoints, batch.confidences, batch.points)
+        seen = stack_observations([frame.detector for frame in frames])
+        joints = detector(_on(detector.device, seen))
+        inputs = [seen[name].numpy() for name in ("initial_joints", "keypoints")]
+        inputs += [np.stack([frame.confidences for frame in frames]), seen["points"].numpy()]
         if self.regressor is None:
             return Prediction(joints.cpu().numpy(), *inputs)
         regressor = self.regressor.module
-        rotmats, betas = (values[-1] for values in regressor(mesh_points, joints))
+        seen = stack_observations([frame.regressor for frame in frames if frame.regressor is not None])
+        rotmats, betas = (
+            values[-1] for values in regressor(_on(regressor.device, seen) | {"initial_joints": joints})
+        )
         body = regressor.body.from_rotmats(rotmats, betas)
         vertices = place_at_root(body.vertices, body.joints[:, ROOT], joints[:, ROOT])
         pose = rotmat_to_rotvec(rotmats).flatten(-2)
@@ -234,45 +216,15 @@ class Pipeline:
         return Prediction(joints.cpu().numpy(), *inputs, *(output.cpu().numpy() for output in outputs))
 
 
-def make_cloud(depth: np.ndarray, camera: Camera, settings: CloudSettings) -> np.ndarray:
-    """A cloud with normals, as in training.
-
-    Args:
-        depth: `(H, W)` float32, metres; 0 is background.
-        camera: The camera of this image.
-        settings: See `CloudSettings`.
-
-    Returns:
-        `(N, 6)` float32: position, metres, camera frame; normal.
-    """
-    spacing = float(np.median(depth[depth > 0])) / camera.fx
-    depth, camera = _every(max(1, int(settings.spacing_m / spacing)), depth, camera)
-    cloud = sample_cloud(depth, camera, settings.num_points, np.random.default_rng(_SEED))
-    normals = get_normal_estimator(settings.normals)(cloud, depth, camera)
-    return np.concatenate([cloud.points, normals], -1)
-
-
-def _every(step: int, depth: np.ndarray, camera: Camera) -> tuple[np.ndarray, Camera]:
-    """Every `step`-th row and column of an image, and the camera that sees just these."""
-    thinned = np.ascontiguousarray(depth[::step, ::step])
-    height, width = thinned.shape
-    return thinned, Camera(
-        camera.fx / step, camera.fy / step, camera.cx / step, camera.cy / step, width, height
-    )
+def _on(device: torch.device, tensors: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    return {name: value.to(device) for name, value in tensors.items()}
 
 
 def _stage(module: Any, checkpoint: Checkpoint) -> Stage:
-    data = checkpoint.config["data"]
-    try:
-        settings = CloudSettings(
-            num_points=data["num_points"],
-            normals=data["normals"],
-            spacing_m=data["distance_m"][0] / data["camera"]["fx"],
-        )
-    except KeyError as error:
+    if checkpoint.recipe is None:
         raise ValueError(
-            f"'{checkpoint.path}': its data's configuration has no {error}, so its clouds cannot be made"
-        ) from error
+            f"'{checkpoint.path}': it was not trained on observations of depth images, so none can be made for it"
+        )
     origin = {
         "path": str(checkpoint.path),
         "hash": checkpoint.file_hash,
@@ -280,4 +232,4 @@ def _stage(module: Any, checkpoint: Checkpoint) -> Stage:
         "epoch": checkpoint.epoch,
         "body_hash": checkpoint.body_hash,
     }
-    return Stage(module, settings, origin)
+    return Stage(module, checkpoint.recipe, origin)

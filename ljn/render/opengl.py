@@ -67,7 +67,8 @@ class PyRender(Renderer):
             except Exception as error:  # PyOpenGL raises a type of its own for each way to have no EGL
                 raise ImportError(
                     f"pyrender cannot make an EGL context ({error}). It needs the system libraries libegl1, "
-                    "libgl1 and libxrender1 and a driver (Mesa's will do); or do without it: data.renderer=zbuffer"
+                    "libgl1 and libxrender1 and a driver (Mesa's will do); or do without it: "
+                    "data.synthesis.renderer=zbuffer"
                 ) from error
         self._renderer.viewport_width, self._renderer.viewport_height = camera.width, camera.height
         return self._renderer

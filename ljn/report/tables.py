@@ -38,7 +38,7 @@ class Axis:
 
     Attributes:
         label: With its unit.
-        key: Where a run's configuration has the value, such as `data.num_points`.
+        key: Where a run's configuration has the value, such as `data.observation.num_points`.
     """
 
     label: str
@@ -130,9 +130,9 @@ ROOT_ALIGNED = {
 """What rows of detectors show whose joints only mean something beside the root."""
 _NO_PCKH = {"mpjpe": "initial_mpjpe", "pckh": None}
 
-_NOISE_2D = Axis("σ of the 2D joints' noise, px", "data.keypoint_noise_px")
-_NOISE_3D = Axis("σ of the 3D joints' noise, m", "data.joint_noise_m")
-_POINTS = Axis("sampled points", "data.num_points")
+_NOISE_2D = Axis("σ of the 2D joints' noise, px", "data.synthesis.keypoint_noise_px")
+_NOISE_3D = Axis("σ of the 3D joints' noise, m", "data.synthesis.joint_noise_m")
+_POINTS = Axis("sampled points", "data.observation.num_points")
 
 _DETECTOR = (_MPJPE_EQ38, PCKH)
 _MESH = (APVE, _MPJPE_EQ38)

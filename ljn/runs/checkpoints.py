@@ -3,7 +3,7 @@
 import hashlib
 import os
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +13,11 @@ from lightning.pytorch.plugins.io import TorchCheckpointIO
 from torch import Tensor
 
 from ljn.building import build
+from ljn.cloud.observation import ObservationRecipe
 from ljn.modules.base import StageModule
 from ljn.reading import READ_ERRORS
 
-CHECKPOINT_VERSION = 2
+CHECKPOINT_VERSION = 3
 _PROVENANCE_KEY = "ljn"
 CONFIG_GROUPS = ("preset", "model", "module", "data", "body", "trainer", "seed", "name", "optimized_metric")
 """The part of a stored configuration that decides what a checkpoint is."""
@@ -30,15 +31,24 @@ class Provenance(Callback):
         body_hash: See `BodyDataModule.body_hash`.
         data_licence: What is to be said of the data's licence.
         run: Name of the run's directory.
+        recipe: How the observations that it was trained on were made; None where there were none.
     """
 
-    def __init__(self, config: Mapping[str, Any], body_hash: str, data_licence: str, run: str) -> None:
+    def __init__(
+        self,
+        config: Mapping[str, Any],
+        body_hash: str,
+        data_licence: str,
+        run: str,
+        recipe: ObservationRecipe | None,
+    ) -> None:
         self.content = {
             "version": CHECKPOINT_VERSION,
             "config": dict(config),
             "body_hash": body_hash,
             "data_licence": data_licence,
             "run": run,
+            "observation": None if recipe is None else asdict(recipe),
         }
 
     def on_save_checkpoint(
@@ -79,6 +89,7 @@ class Checkpoint:
         data_licence: What is said of the data's licence.
         run: Name of the directory of the training run.
         epoch: Epochs completed when it was written.
+        recipe: How the observations that it was trained on were made; None where there were none.
         state: The module's state dict.
         file_hash: First 16 hex digits of the file's SHA-256.
     """
@@ -89,6 +100,7 @@ class Checkpoint:
     data_licence: str
     run: str
     epoch: int
+    recipe: ObservationRecipe | None
     state: dict[str, Tensor]
     file_hash: str
 
@@ -145,9 +157,21 @@ def read_checkpoint(path: str | Path, name: str = "ckpt_path") -> Checkpoint:
         data_licence=provenance["data_licence"],
         run=provenance["run"],
         epoch=int(content["epoch"]) + 1,
+        recipe=_recipe(provenance.get("observation"), path, name),
         state=content["state_dict"],
         file_hash=hashlib.sha256(path.read_bytes()).hexdigest()[:16],
     )
+
+
+def _recipe(content: Any, path: Path, name: str) -> ObservationRecipe | None:
+    if content is None:
+        return None
+    try:
+        return ObservationRecipe(**content)
+    except (TypeError, ValueError) as error:
+        raise ValueError(
+            f"{name}: '{path}' holds no recipe of observations that is known here ({error})"
+        ) from error
 
 
 def _is_ours(content: Any, provenance: Any) -> bool:

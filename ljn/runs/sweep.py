@@ -96,7 +96,7 @@ class Run:
             return {}
 
     def setting(self, key: str) -> float | None:
-        """A number of its configuration, such as `data.num_points`; None where there is none."""
+        """A number of its configuration, such as `data.observation.num_points`; None where there is none."""
         value: Any = self.config
         for part in key.split("."):
             value = _mapping(value).get(part)

@@ -16,7 +16,7 @@ from ljn.tasks.validation import validate
 _SHARED = (
     "sweep=", "preset", "seed=", "body", "data", "trainer", "paths", "logger", "num_threads=", "tags=", "group=",
 )  # fmt: skip
-_OF_STAGE_2 = ("data.initial_joints", "data.joint_noise", "data.detector_ckpt")
+_OF_STAGE_2 = ("data.synthesis.initial_joints", "data.synthesis.joint_noise", "data.detector_ckpt")
 
 
 def cross(cfg: DictConfig) -> dict[str, float]:
@@ -49,7 +49,7 @@ def cross(cfg: DictConfig) -> dict[str, float]:
     build(changed.data)
     if task.detector is not None:
         detector = _trained(_composed(task.detector), task.detector)
-        overrides += ["data.initial_joints=detector", f"data.detector_ckpt='{detector}'"]
+        overrides.append(f"data.detector_ckpt='{detector}'")
     return evaluate_checkpoint(cfg, _trained(cfg.copy(), task.trains), overrides, cfg.name, reuses=True)
 
 

@@ -105,6 +105,7 @@ def _evaluate(
 ) -> dict[str, float]:
     prepare_process(cfg)
     module = build(cfg.module)
+    datamodule.takes = module.takes
     load_state(module, checkpoint)
     check_bodies(checkpoint, {body.hash for body in datamodule.bodies} | set(module.body_hashes))
     facts = {
@@ -184,7 +185,7 @@ def apply_overrides(cfg: DictConfig, overrides: list[str]) -> None:
         if group not in _OVERRIDABLE or "." not in key or not is_value:
             raise ValueError(
                 f"{override.input_line}: model, data and sizes come from the checkpoint; an evaluation can "
-                f"change single values of {', '.join(_OVERRIDABLE)} (data.keypoint_noise_px=15) and choose "
+                f"change single values of {', '.join(_OVERRIDABLE)} (data.synthesis.keypoint_noise_px=15) and choose "
                 "callbacks, logger and paths"
             )
         _set(cfg, key, override.value(), override.input_line)

@@ -81,7 +81,7 @@ def figures(cfg: DictConfig) -> dict[str, float]:
 
     pages: dict[str, list[Column]] = {"joints": [], "meshes": []}
     for path, noise_px in zip(detectors, noise):
-        overrides = [] if noise_px is None else [f"data.keypoint_noise_px={noise_px}"]
+        overrides = [] if noise_px is None else [f"data.synthesis.keypoint_noise_px={noise_px}"]
         pages["joints"].append(_column(cfg, path, JointDetector, "task.detectors", overrides))
     for path in regressors:
         pages["meshes"].append(_column(cfg, path, MeshRegressor, "task.regressors", []))
@@ -112,6 +112,7 @@ def _column(cfg: DictConfig, path: str, kind: type, key: str, overrides: Sequenc
     validate(own)
     prepare_process(own)
     datamodule: BodyDataModule = build(own.data)
+    datamodule.takes = (*module.takes, "points")
     datamodule.prepare_data()
     check_bodies(checkpoint, {body.hash for body in datamodule.bodies} | set(module.body_hashes))
     num_test, wanted = own.data.num_test, cfg.task.num_samples
@@ -122,8 +123,9 @@ def _column(cfg: DictConfig, path: str, kind: type, key: str, overrides: Sequenc
     # The middles of equal parts of the test set.
     indices = [(2 * number + 1) * num_test // (2 * wanted) for number in range(wanted)]
     batch, _ = datamodule.examples("test", indices)
-    source = own.data.initial_joints
-    initial = {"lifted": f"{own.data.keypoint_noise_px:g} px", "noised": f"{own.data.joint_noise_m:g} m"}
+    source = "detector" if own.data.detector_ckpt else own.data.synthesis.initial_joints
+    synthesis = own.data.synthesis
+    initial = {"lifted": f"{synthesis.keypoint_noise_px:g} px", "noised": f"{synthesis.joint_noise_m:g} m"}
     facts = {"checkpoint": str(checkpoint.path), "hash": checkpoint.file_hash, "run": checkpoint.run}
     return Column(
         f"{own.name}, {initial.get(source, source)}",

@@ -15,10 +15,9 @@ from tqdm import tqdm
 from ljn.body.skeleton import JOINT_NAMES
 from ljn.geometry.camera import Camera
 from ljn.geometry.distance import distances_to_mesh
-from ljn.pipeline.depth import body_depth
 from ljn.pipeline.inputs import DEPTH_SUFFIXES, read_camera, read_depth, read_keypoints, read_mask
 from ljn.pipeline.pictures import draw_prediction
-from ljn.pipeline.pipeline import Observation, Pipeline, Prediction
+from ljn.pipeline.pipeline import ObservedFrame, Pipeline, Prediction
 from ljn.pipeline.writing import import_trimesh, write_arrays, write_mesh
 from ljn.runs.files import write_json
 from ljn.tasks.validation import check_writable
@@ -156,7 +155,7 @@ def _predict_frames(
                     # What an earlier call left would pass for this one's.
                     (directory / f"{frame.name}{suffix}").unlink(missing_ok=True)
                 try:
-                    loaded.append((frame, *_load(pipeline, frame, camera)))
+                    loaded.append((frame, _load(pipeline, frame, camera)))
                 except (ValueError, FileNotFoundError) as error:
                     if not may_fail:
                         raise
@@ -165,18 +164,17 @@ def _predict_frames(
                     progress.update()
             if not loaded:
                 continue
-            batch = pipeline.predict([observation for _, _, observation in loaded])
-            for index, (frame, depth, _) in enumerate(loaded):
-                results[frame.name] |= _write(directory / frame.name, batch[index], depth, camera)
+            batch = pipeline.predict([observed for _, observed in loaded])
+            for index, (frame, observed) in enumerate(loaded):
+                results[frame.name] |= _write(directory / frame.name, batch[index], observed.depth, camera)
                 progress.update()
     return results
 
 
-def _load(pipeline: Pipeline, frame: Frame, camera: Camera) -> tuple[np.ndarray, Observation]:
-    """The body's depth `(H, W)`, metres, and what the networks take."""
+def _load(pipeline: Pipeline, frame: Frame, camera: Camera) -> ObservedFrame:
+    """What the networks take of a frame's files."""
     mask = None if frame.mask is None else read_mask(frame.mask)
-    depth = body_depth(read_depth(frame.depth), camera, mask)
-    return depth, pipeline.observe(depth, camera, read_keypoints(frame.keypoints))
+    return pipeline.observe(read_depth(frame.depth), camera, read_keypoints(frame.keypoints), mask)
 
 
 def _write(path: Path, prediction: Prediction, depth: np.ndarray, camera: Camera) -> dict[str, Any]:

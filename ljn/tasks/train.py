@@ -68,6 +68,7 @@ def _train(
 ) -> dict[str, float]:
     prepare_process(cfg)
     module = build(cfg.module)
+    datamodule.takes = module.takes
     check_trains_in_processes(module, num_processes(cfg.trainer))
     last, best = (run_dir / "checkpoints" / f"{name}.ckpt" for name in ("last", "best"))
     if cfg.rerun and is_first_process():
@@ -146,7 +147,9 @@ def build_trainer(
 ) -> lightning.Trainer:
     """The trainer with its callbacks and loggers, writing below the run's directory."""
     body_hashes = {*datamodule.body_hash.split("-"), *module.body_hashes}
-    provenance = Provenance(config, "-".join(sorted(body_hashes)), datamodule.licence, run_dir.name)
+    provenance = Provenance(
+        config, "-".join(sorted(body_hashes)), datamodule.licence, run_dir.name, datamodule.recipe
+    )
     return build(
         cfg.trainer,
         default_root_dir=str(run_dir),

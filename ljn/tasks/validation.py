@@ -63,7 +63,8 @@ def _check_radii(model: dict[str, Any]) -> None:
 def _check_integers(plain: dict[str, Any]) -> None:
     smallest: dict[int, dict[str, tuple[str, ...]]] = {
         1: {
-            "data": ("num_points", "num_train", "num_val", "num_test", "batch_size", "prefetch_batches"),
+            "data.observation": ("num_points", "crop_px"),
+            "data": ("num_train", "num_val", "num_test", "batch_size", "prefetch_batches"),
             "model": ("group_size",),
             "trainer": ("max_epochs",),
         },
@@ -72,7 +73,9 @@ def _check_integers(plain: dict[str, Any]) -> None:
     for least, groups in smallest.items():
         for group, keys in groups.items():
             for key in keys:
-                values = plain.get(group) or {}
+                values: Any = plain
+                for part in group.split("."):
+                    values = (values or {}).get(part) or {}
                 if key in values and not (isinstance(values[key], int) and values[key] >= least):
                     raise ValueError(
                         f"{group}.{key}: expected an integer of {least} or more, got {values[key]!r}"
@@ -100,12 +103,13 @@ def _check_set_abstractions(plain: dict[str, Any]) -> None:
             f"{name}: expected no number greater than the one before, got {centres}: each set abstraction takes its "
             f"centres from those before; set preset.mesh.num_centres={_as_override(sorted(centres, reverse=True))}"
         )
-    num_points = (plain.get("data") or {}).get("num_points")
+    num_points = ((plain.get("data") or {}).get("observation") or {}).get("num_points")
     if num_points is not None and centres[0] > num_points:
         fitting = _as_override(min(number, num_points) for number in centres)
         raise ValueError(
-            f"{name}: expected at most data.num_points={num_points} centres, since they are taken from the cloud's "
-            f"points, got {centres}; set data.num_points={centres[0]} or more, or preset.mesh.num_centres={fitting}"
+            f"{name}: expected at most data.observation.num_points={num_points} centres, since they are taken from the "
+            f"cloud's points, got {centres}; set data.observation.num_points={centres[0]} or more, or "
+            f"preset.mesh.num_centres={fitting}"
         )
 
 

@@ -79,7 +79,7 @@ def main() -> None:
     )
     keys = [(0, index) for index in range(NUM_TEST)]
     chunks = [keys[start : start + CHUNK] for start in range(0, NUM_TEST, CHUNK)]
-    keypoints = np.concatenate([synthesizer.batch(chunk)["keypoints_2d"].numpy() for chunk in chunks])
+    keypoints = np.concatenate([synthesizer.batch(chunk)["true_keypoints"].numpy() for chunk in chunks])
     keypoints = keypoints.astype(np.float64)
 
     cases = {

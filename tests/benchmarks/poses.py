@@ -183,7 +183,7 @@ def kind_of(sequence: str) -> str:
 def rows(scorer: Scorer) -> Iterator[list[str]]:
     """The table's rows."""
     source = EmbeddedSource()
-    mixture = source.mixture("train")
+    mixture = source.mixture.of("train")
     records = source.records("train", NUM_POOL, 0)
     pool = to_rotmat(records.pose)
     yield [
@@ -245,7 +245,7 @@ def print_subjects(scorer: Scorer) -> None:
 
 def print_limits() -> None:
     """Print how much joint limits change the clips."""
-    clips = torch.cat([EmbeddedSource().mixture(split).donors.rotmat for split in SPLITS])
+    clips = torch.cat([EmbeddedSource().mixture.of(split).donors.rotmat for split in SPLITS])
     held = within_limits(clips)
     turned = rotmat_to_rotvec(clips.mT @ held).norm(dim=-1).rad2deg()
     moved = (features(held) - features(clips)).norm(dim=-1)

@@ -43,7 +43,7 @@ def test_a_seed_that_ran_again_takes_the_place_of_the_earlier_run(end_job):
     end_job("first", 1, "b")
     jobs = end_job("second", 0, "with-another-hash", typed=("num_threads=1", "paths.output_dir=elsewhere"))
     assert sorted(job["run_dir"] for job in jobs) == ["runs/b", "runs/with-another-hash"]
-    jobs = end_job("third", 0, "c", typed=("data.num_points=64",))
+    jobs = end_job("third", 0, "c", typed=("data.observation.num_points=64",))
     assert len(jobs) == 3, "another row"
 
 
@@ -59,8 +59,8 @@ def test_a_failure_is_kept_among_the_rows_of_a_later_call_until_it_is_mended(end
 
 
 def test_a_failure_with_other_settings_is_forgotten(end_job):
-    end_job("first", 0, "a", JobStatus.FAILED, typed=("data.num_points=0",))
-    assert len(end_job("second", 0, "b", typed=("data.num_points=64",))) == 1
+    end_job("first", 0, "a", JobStatus.FAILED, typed=("data.observation.num_points=0",))
+    assert len(end_job("second", 0, "b", typed=("data.observation.num_points=64",))) == 1
 
 
 def test_tables_that_cannot_be_written_end_the_call_as_failed(tmp_path, monkeypatch):

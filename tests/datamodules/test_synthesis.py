@@ -1,4 +1,3 @@
-import dataclasses
 import math
 import os
 import pickle
@@ -14,6 +13,7 @@ from datamodules.sources import PoseRecords
 from datamodules.synthesis import DepthSynthesizer, SynthesisSettings, concatenate
 from ljn.body import SMPL
 from ljn.body.skeleton import JOINT_INDEX, ROOT
+from ljn.cloud.observation import ObservationRecipe
 from ljn.data import Batch
 from ljn.geometry.camera import Camera, project
 from ljn.geometry.rotations import (
@@ -26,8 +26,8 @@ from ljn.geometry.rotations import (
 
 KEYS = [(0, index) for index in range(12)]
 # What no random draw after the placement touches.
-TRUTH = ("keypoints_2d", "joints", "pose", "betas", "gender", "camera", "sample_id")
-NOISY = ("points", "noisy_keypoints_2d", "initial_joints")
+TRUTH = ("true_keypoints", "joints", "pose", "betas", "gender", "camera", "sample_id")
+NOISY = ("points", "keypoints", "initial_joints")
 
 
 @pytest.fixture(scope="module")
@@ -36,9 +36,12 @@ def make(body_models, source, kinect):
     records = source.records("val", 12, seed=2)
     layers = {dtype: SMPL(body_models).to(dtype) for dtype in (torch.float32, torch.float64)}
 
-    def build(seed_key=(0, 0), dtype=torch.float64, records=records, **changes):
-        settings = SynthesisSettings(**{"camera": kinect, "num_points": 64, **changes})
-        synthesizer = DepthSynthesizer(records, body_models, settings, seed_key, dtype)
+    def build(
+        seed_key=(0, 0), dtype=torch.float64, records=records, camera=kinect, num_points=64,
+        takes=("points",), **changes,
+    ):  # fmt: skip
+        settings, recipe = SynthesisSettings(**changes), ObservationRecipe(num_points)
+        synthesizer = DepthSynthesizer(records, body_models, camera, settings, recipe, takes, seed_key, dtype)
         synthesizer.__dict__["_smpl"] = layers[dtype]  # building it would take longer than all the rest
         return synthesizer
 
@@ -78,8 +81,8 @@ def meshes(body_models, batch):
 def test_a_batch_keeps_its_contract(batch):
     shapes = {
         "points": (12, 64, 6),
-        "keypoints_2d": (12, 24, 2),
-        "noisy_keypoints_2d": (12, 24, 2),
+        "true_keypoints": (12, 24, 2),
+        "keypoints": (12, 24, 2),
         "initial_joints": (12, 24, 3),
         "joints": (12, 24, 3),
         "pose": (12, 72),
@@ -88,7 +91,7 @@ def test_a_batch_keeps_its_contract(batch):
         "camera": (12, 4),
         "sample_id": (12,),
     }
-    assert set(batch) == set(Batch.__annotations__) == set(shapes)
+    assert set(batch) == set(Batch.__annotations__) - {"crop", "crop_camera"} == set(shapes)
     for name, shape in shapes.items():
         assert batch[name].shape == shape, name
         assert batch[name].dtype == (torch.int64 if name in ("gender", "sample_id") else torch.float32), name
@@ -120,15 +123,15 @@ def test_float32_gives_the_same_bodies_as_float64(make, batch):
     single = make(dtype=torch.float32).batch(KEYS)
     torch.testing.assert_close(single["joints"], batch["joints"], atol=1e-5, rtol=0)
     torch.testing.assert_close(single["pose"], batch["pose"], atol=1e-5, rtol=0)
-    torch.testing.assert_close(single["noisy_keypoints_2d"], batch["noisy_keypoints_2d"], atol=1e-2, rtol=0)
+    torch.testing.assert_close(single["keypoints"], batch["keypoints"], atol=1e-2, rtol=0)
 
 
 @pytest.mark.parametrize(("seed_key", "epoch"), [((0, 0), 1), ((1, 0), 0), ((0, 1), 0)])
 def test_another_seed_split_or_epoch_draws_everything_anew(make, batch, seed_key, epoch):
     other = make(seed_key).batch([(epoch, index) for _, index in KEYS])
-    for name in ("points", "noisy_keypoints_2d", "joints"):
+    for name in ("points", "keypoints", "joints"):
         assert (other[name] != batch[name]).flatten(1).any(1).all(), name
-    noises = [b["noisy_keypoints_2d"] - b["keypoints_2d"] for b in (batch, other)]
+    noises = [b["keypoints"] - b["true_keypoints"] for b in (batch, other)]
     assert (noises[0] - noises[1]).abs().mean() > 5
     # The records' own pose and shape stay; only the heading is drawn.
     assert torch.equal(other["betas"], batch["betas"])
@@ -148,12 +151,12 @@ def test_the_keypoints_noise_leaves_everything_else(make, batch, noise_px):
     other = make(keypoint_noise_px=noise_px).batch(KEYS)
     for name in (*TRUTH, "points"):
         assert torch.equal(other[name], batch[name]), name
-    assert not torch.equal(other["noisy_keypoints_2d"], batch["noisy_keypoints_2d"])
+    assert not torch.equal(other["keypoints"], batch["keypoints"])
 
 
 def test_the_depth_noise_leaves_keypoints_places_and_the_choice_of_pixels(make, batch):
     clean = make(depth_noise_m=0.0).batch(KEYS)
-    for name in (*TRUTH, "noisy_keypoints_2d"):
+    for name in (*TRUTH, "keypoints"):
         assert torch.equal(clean[name], batch[name]), name
     pixels = [project(b["points"][..., :3], b["camera"]) for b in (clean, batch)]
     torch.testing.assert_close(*pixels, atol=1e-3, rtol=0)
@@ -175,13 +178,13 @@ def test_a_synthesizer_survives_its_way_to_another_process(make, batch):
 
 def test_joints_project_onto_the_keypoints(batch):
     torch.testing.assert_close(
-        project(batch["joints"], batch["camera"]), batch["keypoints_2d"], atol=1e-3, rtol=0
+        project(batch["joints"], batch["camera"]), batch["true_keypoints"], atol=1e-3, rtol=0
     )
 
 
 def test_initial_joints_project_onto_the_noisy_keypoints(batch):
     torch.testing.assert_close(
-        project(batch["initial_joints"], batch["camera"]), batch["noisy_keypoints_2d"], atol=1e-3, rtol=0
+        project(batch["initial_joints"], batch["camera"]), batch["keypoints"], atol=1e-3, rtol=0
     )
 
 
@@ -249,8 +252,8 @@ def test_the_heading_is_part_of_the_pose(make, batch, body_models):
 def test_another_camera_sees_the_same_bodies(make, batch, kinect):
     half = Camera(kinect.fx / 2, kinect.fy / 2, kinect.cx / 2, kinect.cy / 2, 212, 256)
     small = make(camera=half, margin_px=4).batch(KEYS)
-    assert small["keypoints_2d"].min() >= 0
-    assert (small["keypoints_2d"] <= torch.tensor([211.0, 255.0])).all()
+    assert small["true_keypoints"].min() >= 0
+    assert (small["true_keypoints"] <= torch.tensor([211.0, 255.0])).all()
     torch.testing.assert_close(small["camera"][0], half.intrinsics())
     # Nearly the same field of view, so nearly the same place.
     torch.testing.assert_close(small["joints"], batch["joints"], atol=0.05, rtol=0)
@@ -262,7 +265,7 @@ def test_another_camera_sees_the_same_bodies(make, batch, kinect):
 @pytest.mark.parametrize("noise_px", [5.0, 10.0, 15.0])
 def test_the_mean_distance_of_noisy_keypoints_is_that_of_a_plane_gaussian(noise_px):
     keypoints = np.zeros((100_000, 2), np.float32)
-    noisy = add_keypoint_noise(keypoints, noise_px, None, np.random.default_rng(0))
+    noisy = add_keypoint_noise(keypoints, noise_px, np.random.default_rng(0))
     assert noisy.dtype == np.float32
     mean = np.linalg.norm(noisy, axis=-1).mean()
     assert mean == pytest.approx(noise_px * math.sqrt(math.pi / 2), rel=0.01)
@@ -271,7 +274,7 @@ def test_the_mean_distance_of_noisy_keypoints_is_that_of_a_plane_gaussian(noise_
 def test_a_sweep_over_sigma_shares_its_draws():
     keypoints = np.random.default_rng(1).uniform(0, 400, (24, 2)).astype(np.float32)
     draws = [
-        (add_keypoint_noise(keypoints, sigma, None, np.random.default_rng(0)) - keypoints) / sigma
+        (add_keypoint_noise(keypoints, sigma, np.random.default_rng(0)) - keypoints) / sigma
         for sigma in (5.0, 10.0, 15.0)
     ]
     np.testing.assert_allclose(draws[0], draws[1], atol=1e-5)
@@ -281,25 +284,21 @@ def test_a_sweep_over_sigma_shares_its_draws():
 def test_a_sweep_over_sigma_shares_its_draws_through_the_whole_synthesis(make, kinect):
     fives, tens = (make(keypoint_noise_px=sigma).batch(KEYS) for sigma in (5.0, 10.0))
     limit = torch.tensor([kinect.width - 1.0, kinect.height - 1.0])
-    inside = (tens["noisy_keypoints_2d"] > 0) & (tens["noisy_keypoints_2d"] < limit)
+    inside = (tens["keypoints"] > 0) & (tens["keypoints"] < limit)
     assert inside.float().mean() > 0.95
-    noises = [(b["noisy_keypoints_2d"] - b["keypoints_2d"])[inside] for b in (fives, tens)]
+    noises = [(b["keypoints"] - b["true_keypoints"])[inside] for b in (fives, tens)]
     torch.testing.assert_close(2 * noises[0], noises[1], atol=1e-3, rtol=0)
 
 
 def test_without_noise_the_keypoints_are_the_true_ones(make):
     clean = make(keypoint_noise_px=0.0).batch(KEYS)
-    assert torch.equal(clean["noisy_keypoints_2d"], clean["keypoints_2d"])
+    assert torch.equal(clean["keypoints"], clean["true_keypoints"])
 
 
-def test_noisy_keypoints_are_clipped_to_the_image(kinect):
-    keypoints = np.array([[1.0, 1.0], [422.0, 510.0]] * 500)
-    noisy = add_keypoint_noise(keypoints, 50.0, kinect, np.random.default_rng(0))
+def test_noisy_keypoints_are_clipped_to_the_image(make, kinect):
+    noisy = make(keypoint_noise_px=200.0).batch(KEYS)["keypoints"]
     assert noisy.min() == 0
-    assert noisy.max(0).tolist() == [kinect.width - 1, kinect.height - 1]
-    free = add_keypoint_noise(keypoints, 50.0, None, np.random.default_rng(0))
-    inside = (free >= 0) & (free <= [kinect.width - 1, kinect.height - 1])
-    np.testing.assert_array_equal(noisy[inside], free[inside])
+    assert noisy.amax((0, 1)).tolist() == [kinect.width - 1, kinect.height - 1]
 
 
 # Joining batches
@@ -344,21 +343,29 @@ def test_poses_without_a_heading_of_their_own_cannot_keep_it(make):
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("settings", "change", "message"),
     [
-        ({"num_points": 0}, "num_points: expected at least 1, got 0"),
-        ({"heading": "front"}, "heading: expected one of source, histogram, uniform, got 'front'"),
+        (ObservationRecipe, {"num_points": 0}, "num_points: expected at least 1, got 0"),
+        (ObservationRecipe, {"crop_px": 0}, "crop_px: expected at least 1, got 0"),
+        (ObservationRecipe, {"spacing_m": -1.0}, "spacing_m: expected a positive number"),
+        (ObservationRecipe, {"normals": "pca"}, "normals: expected one of window, knn, open3d, got 'pca'"),
         (
-            {"renderer": "opengl"},
-            "renderer: expected one of auto, zbuffer, torch, pyrender, open3d, got 'opengl'",
+            SynthesisSettings,
+            {"heading": "front"},
+            "heading: expected one of source, histogram, uniform, got 'front'",
         ),
-        ({"distance_m": (0.0, 2.0)}, "distance_m: expected 0 < nearest <= farthest"),
-        ({"distance_m": (3.0, 2.0)}, "distance_m: expected 0 < nearest <= farthest"),
-        ({"margin_px": -1.0}, "margin_px: expected a number of 0 or more, got -1"),
-        ({"depth_noise_m": -0.1}, "depth_noise_m: expected a number of 0 or more"),
-        ({"keypoint_noise_px": -5.0}, "keypoint_noise_px: expected a number of 0 or more"),
+        (
+            SynthesisSettings,
+            {"renderer": "opengl"},
+            "renderer: expected one of auto, zbuffer, torch, .*got 'opengl'",
+        ),
+        (SynthesisSettings, {"distance_m": (0.0, 2.0)}, "distance_m: expected 0 < nearest <= farthest"),
+        (SynthesisSettings, {"distance_m": (3.0, 2.0)}, "distance_m: expected 0 < nearest <= farthest"),
+        (SynthesisSettings, {"margin_px": -1.0}, "margin_px: expected a number of 0 or more, got -1"),
+        (SynthesisSettings, {"depth_noise_m": -0.1}, "depth_noise_m: expected a number of 0 or more"),
+        (SynthesisSettings, {"keypoint_noise_px": -5.0}, "keypoint_noise_px: expected a number of 0 or more"),
     ],
 )
-def test_impossible_settings_are_errors_before_anything_is_rendered(kinect, change, message):
+def test_impossible_settings_are_errors_before_anything_is_rendered(settings, change, message):
     with pytest.raises(ValueError, match=message):
-        dataclasses.replace(SynthesisSettings(kinect, 64), **change)
+        settings(**change)

@@ -2,6 +2,7 @@ import logging
 import math
 import os
 import resource
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -12,9 +13,10 @@ from datamodules.batches import EpochSampler
 from datamodules.placement import place
 from datamodules.sources import SPLITS
 from datamodules.sources.embedded import EmbeddedSource
-from datamodules.synthesis import concatenate
+from datamodules.synthesis import SynthesisSettings, concatenate
 from ljn.body import SMPL
 from ljn.body.skeleton import ROOT
+from ljn.cloud.observation import ObservationRecipe
 from ljn.geometry.camera import project
 from ljn.geometry.rotations import CAMERA_FROM_BODY, rotvec_to_rotmat
 
@@ -79,7 +81,7 @@ def test_validation_sets_depend_on_neither_the_training_seed_nor_its_size(make_d
 def test_a_smaller_validation_set_shares_its_draws_with_a_larger_one(make_datamodule):
     # The same placement and noise for the same index; the records are drawn for the whole set.
     few, many = (val_set(make_datamodule(num_val=number)) for number in (4, 6))
-    noises = [s["noisy_keypoints_2d"][:4] - s["keypoints_2d"][:4] for s in (few, many)]
+    noises = [s["keypoints"][:4] - s["true_keypoints"][:4] for s in (few, many)]
     assert (noises[0] - noises[1]).abs().median() < 1e-3
 
 
@@ -110,9 +112,7 @@ def test_the_test_set_is_another_than_the_validation_set(make_datamodule):
     datamodule.setup("test")
     (val,), (test,) = datamodule.val_dataloader(), datamodule.test_dataloader()
     assert (val["betas"] != test["betas"]).any(1).all()
-    assert (
-        val["noisy_keypoints_2d"] - val["keypoints_2d"] != test["noisy_keypoints_2d"] - test["keypoints_2d"]
-    ).any()
+    assert (val["keypoints"] - val["true_keypoints"] != test["keypoints"] - test["true_keypoints"]).any()
 
 
 def test_what_goes_into_records_has_the_motion_capture_of_each_split_that_is_read(make_datamodule, source):
@@ -121,25 +121,30 @@ def test_what_goes_into_records_has_the_motion_capture_of_each_split_that_is_rea
     assert datamodule.describe(("test",))["motion"] == {"test": {"clips": 5, "frames": 1238}}
 
 
-def test_the_key_of_a_fixed_set_follows_everything_that_it_depends_on(make_datamodule):
+# Another value of every field of the settings objects; a new field fails the test until it stands here.
+OTHER = {
+    "heading": "uniform", "distance_m": (1.5, 2.5), "margin_px": 9.0, "depth_noise_m": 0.002, "keypoint_noise_px": 5.0,
+    "initial_joints": "noised", "joint_noise_m": 0.01, "joint_noise": "isotropic", "renderer": "zbuffer",
+    "num_points": 33, "normals": "knn", "crop_px": 64, "spacing_m": 0.01,
+    "fx": 360.0, "fy": 360.0, "cx": 200.0, "cy": 250.0, "width": 420, "height": 500,
+}  # fmt: skip
+
+
+def test_the_key_of_a_fixed_set_follows_everything_that_it_depends_on(make_datamodule, kinect):
     changes = [
-        {},
         {"num_val": 21},
         {"pool_seed": 1},
         {"eval_seed": 1},
-        {"num_points": 33},
-        {"heading": "uniform"},
-        {"distance_m": (1.5, 2.5)},
-        {"margin_px": 9},
-        {"depth_noise_m": 0.002},
-        {"keypoint_noise_px": 5.0},
-        {"renderer": "zbuffer"},
-        {"normals": "open3d"},
         {"source": EmbeddedSource(jitter_deg=3.0)},
-        {"source": EmbeddedSource(max_beta=1.0)},
     ]
-    keys = [make_datamodule(**change).fixed_key("val") for change in changes]
+    for settings in (SynthesisSettings, ObservationRecipe):
+        changes += [{field.name: OTHER[field.name]} for field in fields(settings)]
+    changes += [{"camera": replace(kinect, **{field.name: OTHER[field.name]})} for field in fields(kinect)]
+    keys = [make_datamodule(**change).fixed_key("val") for change in ({}, *changes)]
     keys.append(make_datamodule().fixed_key("test"))
+    image = make_datamodule()
+    image.takes = ("crop", "crop_camera")
+    keys.append(image.fixed_key("val"))
     assert len(set(keys)) == len(keys)
 
 
@@ -181,7 +186,7 @@ def test_epochs_differ_in_order_and_draws_and_a_resumed_epoch_equals_a_reached_o
     assert one["sample_id"].tolist() != other["sample_id"].tolist()
     one, other = ({name: b[name][b["sample_id"].argsort()] for name in b} for b in (one, other))
     assert torch.equal(one["betas"], other["betas"])
-    for name in ("points", "joints", "noisy_keypoints_2d"):
+    for name in ("points", "joints", "keypoints"):
         assert (one[name] != other[name]).flatten(1).any(1).all(), name
 
 
@@ -192,7 +197,7 @@ def test_training_follows_both_of_its_seeds(train_loader, seed, pool_seed):
         (batch,) = batches_of(train_loader(num_train=4, batch_size=4, **seeds), 0, number=1)
         batches.append({name: batch[name][batch["sample_id"].argsort()] for name in batch})
     assert torch.equal(batches[0]["betas"], batches[1]["betas"]) == (pool_seed == 0)
-    noises = [b["noisy_keypoints_2d"] - b["keypoints_2d"] for b in batches]
+    noises = [b["keypoints"] - b["true_keypoints"] for b in batches]
     assert ((noises[0] - noises[1]).abs().median() < 1e-3) == (seed == 0)
 
 
@@ -279,11 +284,6 @@ def test_poses_that_are_not_finite_are_found_before_anything_is_rendered(make_da
     with pytest.raises(ValueError, match=r"poses: .*poses\.npz holds NaN or infinite values"):
         datamodule.prepare_data()
     assert not (tmp_path / "samples").exists()
-
-
-def test_an_unknown_estimator_of_normals_is_found_before_anything_is_rendered(make_datamodule):
-    with pytest.raises(ValueError, match="normals: expected one of window, knn, open3d, got 'pca'"):
-        make_datamodule(normals="pca").prepare_data()
 
 
 @pytest.mark.parametrize("split", ["train", "val", "test"])

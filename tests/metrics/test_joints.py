@@ -45,8 +45,8 @@ def make_batch(num_samples):
         "pred_joints": joints + 0.05 * noise(3),
         "joints": joints,
         "initial_joints": joints + 0.08 * noise(3),
-        "noisy_keypoints_2d": keypoints + 10 * noise(2),
-        "keypoints_2d": keypoints,
+        "keypoints": keypoints + 10 * noise(2),
+        "true_keypoints": keypoints,
     }
 
 

@@ -12,7 +12,7 @@ EXPERIMENTS = ("proposed", "single", "pointnet", "basic")
 def test_eight_samples_are_overfitted(experiment, compose_config, tmp_path):
     cfg = compose_config(
         *(f"experiment=mesh/{experiment}", "preset=small", f"paths.output_dir={tmp_path}"),
-        *("data.num_train=8", "data.num_points=128", "data.num_workers=0"),
+        *("data.num_train=8", "data.observation.num_points=128", "data.num_workers=0"),
         *("preset.mesh.num_centres=[32,8]", "preset.mesh.group_sizes=[8,8]"),
         "preset.mesh.channels=[[32,32],[64,64]]",
     )

@@ -5,12 +5,13 @@ import torch
 from datamodules.sources import PoseRecords
 from datamodules.synthesis import DepthSynthesizer, SynthesisSettings
 from ljn.body import GENDERS
+from ljn.cloud.observation import ObservationRecipe
 from ljn.modules.joint_detector import JointDetector
 from ljn.modules.mesh_regressor import MeshRegressor
 from ljn.nets.body_network import DirectBodyNetwork
 from ljn.nets.joint_network import LocalJointNetwork
 from ljn.nets.pointnet import PointNet
-from ljn.pipeline.pipeline import CloudSettings, Pipeline, Stage
+from ljn.pipeline.pipeline import Pipeline, Stage
 
 NUM_POINTS = 128
 
@@ -28,8 +29,8 @@ def stages():
     detector = JointDetector(LocalJointNetwork([0.25] * 24, group_size=16, **sizes))
     trunk = PointNet(78, (8, 8), (8, 16))
     regressor = MeshRegressor(DirectBodyNetwork(trunk, head_channels=(8,), regressor_channels=(8,)))
-    cloud = CloudSettings(NUM_POINTS, "window", spacing_m=1.5 / 366.458)
-    return [Stage(module.eval().requires_grad_(False), cloud, {}) for module in (detector, regressor)]
+    recipe = ObservationRecipe(NUM_POINTS, "window", spacing_m=1.5 / 366.458)
+    return [Stage(module.eval().requires_grad_(False), recipe, {}) for module in (detector, regressor)]
 
 
 @pytest.fixture(scope="session")
@@ -50,7 +51,8 @@ def samples(kinect, body_models):
         frame=np.arange(3),
         has_heading=False,
     )
-    synthesizer = DepthSynthesizer(records, body_models, SynthesisSettings(kinect, NUM_POINTS), (7, 0))
+    recipe, takes = ObservationRecipe(NUM_POINTS), ("points", "crop")
+    synthesizer = DepthSynthesizer(records, body_models, kinect, SynthesisSettings(), recipe, takes, (7, 0))
     made = [synthesizer.examples([(0, index)]) for index in range(3)]
     return [(batch, depth[0].numpy()) for batch, depth in made]
 
@@ -59,4 +61,4 @@ def samples(kinect, body_models):
 def given(samples):
     """A valid input: depth (metres), keypoints."""
     batch, depth = samples[0]
-    return depth.copy(), batch["noisy_keypoints_2d"][0].numpy().copy()
+    return depth.copy(), batch["keypoints"][0].numpy().copy()

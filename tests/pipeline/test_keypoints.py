@@ -8,7 +8,7 @@ from ljn.pipeline.keypoints import MIN_KNOWN, ORDERS, fill_missing, smpl_keypoin
 @pytest.fixture
 def truth(samples):
     """The 24 joints of a sample, projected `(24, 2)`, pixels."""
-    return samples[0][0]["keypoints_2d"][0].numpy().astype(np.float64)
+    return samples[0][0]["true_keypoints"][0].numpy().astype(np.float64)
 
 
 def in_order(truth, name):

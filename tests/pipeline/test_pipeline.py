@@ -6,9 +6,10 @@ import torch
 
 from ljn.body import SMPL
 from ljn.body.skeleton import ROOT
+from ljn.cloud.observation import ObservationRecipe, observe
 from ljn.geometry.camera import Camera, project
 from ljn.geometry.rotations import CAMERA_FROM_BODY
-from ljn.pipeline.pipeline import CloudSettings, Pipeline, make_cloud
+from ljn.pipeline.pipeline import Pipeline
 from ljn.render import get_renderer
 
 
@@ -22,22 +23,26 @@ def assert_equal(first, second, atol=0.0):
         np.testing.assert_allclose(value, arrays(second)[name], rtol=0, atol=atol, err_msg=name)
 
 
-def test_it_makes_the_inputs_of_training_and_predicts_what_evaluation_does(
+def test_it_observes_as_training_does_and_predicts_what_evaluation_does(
     samples, stages, pipeline, kinect, monkeypatch
 ):
     for index, (batch, depth) in enumerate(samples):
         # The stream that the sample's own points were drawn from: seed, split, epoch, index, purpose.
         monkeypatch.setattr("ljn.pipeline.pipeline._SEED", [7, 0, 0, index, 2])
-        found = pipeline(depth, kinect, batch["noisy_keypoints_2d"][0].numpy())
-        np.testing.assert_array_equal(found.points, batch["points"][0])
-        np.testing.assert_array_equal(found.initial_joints, batch["initial_joints"][0])
+        keypoints = batch["keypoints"][0].numpy()
+        frame = pipeline.observe(depth, kinect, keypoints)
+        for observation in (frame.detector, frame.regressor):
+            for name, value in observation.items():
+                np.testing.assert_array_equal(value, batch[name][0], err_msg=name)
+        prediction = pipeline(depth, kinect, keypoints)
+        np.testing.assert_array_equal(prediction.points, batch["points"][0])
         detector, regressor = (stage.module for stage in stages)
         joints = detector.evaluate(batch, detector.test_metrics)["pred_joints"]
-        np.testing.assert_array_equal(found.joints, joints[0])
+        np.testing.assert_array_equal(prediction.joints, joints[0])
         expected = regressor.evaluate({**batch, "initial_joints": joints}, regressor.test_metrics)
-        np.testing.assert_array_equal(found.vertices, expected["pred_vertices"][0])
-        np.testing.assert_array_equal(found.pose, expected["pred_pose"][0])
-        np.testing.assert_array_equal(found.betas, expected["pred_betas"][0])
+        np.testing.assert_array_equal(prediction.vertices, expected["pred_vertices"][0])
+        np.testing.assert_array_equal(prediction.pose, expected["pred_pose"][0])
+        np.testing.assert_array_equal(prediction.betas, expected["pred_betas"][0])
 
 
 def test_the_mesh_of_pose_and_shape_is_placed_at_the_detected_root(pipeline, given, kinect):
@@ -53,7 +58,7 @@ def test_the_mesh_of_pose_and_shape_is_placed_at_the_detected_root(pipeline, giv
 
 def test_a_batch_gives_what_its_images_give_alone(pipeline, samples, kinect):
     depth = np.stack([image for _, image in samples])
-    keypoints = [batch["noisy_keypoints_2d"][0].numpy() for batch, _ in samples]
+    keypoints = [batch["keypoints"][0].numpy() for batch, _ in samples]
     together = pipeline(depth, kinect, keypoints)
     assert together.vertices.shape == (3, 6890, 3)
     for index in range(3):
@@ -89,12 +94,13 @@ def test_without_a_regressor_there_are_joints_alone(stages, given, kinect):
 
 
 def test_each_stage_gets_the_cloud_of_its_own_training(stages, given, kinect):
-    other = stages[1]._replace(cloud=CloudSettings(64, "knn", stages[1].cloud.spacing_m))
-    observation = Pipeline(stages[0], other).observe(given[0], kinect, given[1])
-    assert observation.points.shape == (128, 6)
-    assert observation.mesh_points.shape == (64, 6)
-    np.testing.assert_array_equal(observation.points[:64, :3], observation.mesh_points[:, :3])
-    assert not np.array_equal(observation.points[:64, 3:], observation.mesh_points[:, 3:])
+    other = stages[1]._replace(recipe=ObservationRecipe(64, "knn", spacing_m=stages[1].recipe.spacing_m))
+    frame = Pipeline(stages[0], other).observe(given[0], kinect, given[1])
+    points, mesh_points = frame.detector["points"], frame.regressor["points"]
+    assert points.shape == (128, 6)
+    assert mesh_points.shape == (64, 6)
+    np.testing.assert_array_equal(points[:64, :3], mesh_points[:, :3])
+    assert not np.array_equal(points[:64, 3:], mesh_points[:, 3:])
 
 
 def test_a_lying_camera_of_another_size_sees_the_same_person(pipeline, samples):
@@ -127,8 +133,11 @@ def test_pixels_much_denser_than_in_training_are_thinned_to_patches_of_the_same_
         images.append(
             np.where((abs(x) < 0.13) & (abs(v - one.cy) < 0.13 * one.fy), depth, 0).astype(np.float32)
         )
-    settings = CloudSettings(256, "window", 1.5 / kinect.fx)
-    coarse, fine = (make_cloud(image, one, settings) for image, one in zip(images, (kinect, camera)))
+    recipe = ObservationRecipe(256, spacing_m=1.5 / kinect.fx)
+    coarse, fine = (
+        observe(image, one, None, recipe, ("points",), np.random.default_rng(0))["points"]
+        for image, one in zip(images, (kinect, camera))
+    )
     # The fine camera's every third pixel is the coarse camera's image.
     np.testing.assert_allclose(fine, coarse, atol=2e-3)
     np.testing.assert_allclose(fine[:, 3:] @ np.array([0.3, 0, -1]) / np.hypot(0.3, 1), 1, atol=1e-4)

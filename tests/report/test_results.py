@@ -83,17 +83,19 @@ def test_a_number_that_was_not_finite_is_no_result_to_be_proud_of(sweep):
 def test_an_experiment_that_ran_with_several_settings_has_a_row_for_each(sweep):
     for number in (512, 1024):
         sweep.run(
-            "detector/basic", {"mpjpe_eq38": number}, overrides=(f"data.num_points={number}", "num_threads=1")
+            "detector/basic",
+            {"mpjpe_eq38": number},
+            overrides=(f"data.num_test={number}", "num_threads=1"),
         )
     rows = cells(sweep.write("table_3_2"))
-    assert rows["basic (data.num_points=512)"].cells[0].mean == 512
-    assert rows["basic (data.num_points=1024)"].cells[0].mean == 1024
+    assert rows["basic (data.num_test=512)"].cells[0].mean == 512
+    assert rows["basic (data.num_test=1024)"].cells[0].mean == 1024
 
 
 def test_a_free_grid_has_a_row_for_each_setting_that_varies(sweep):
     for seed in (0, 1):
         for edm in ("true", "false"):
-            overrides = (f"model.edm={edm}", "data.num_points=512", "preset=smoke")
+            overrides = (f"model.edm={edm}", "data.num_test=512", "preset=smoke")
             sweep.run(None, {"mpjpe": 60 + seed, "pckh": 50.0}, seed, overrides)
     (table,) = read_results(sweep.write()).tables
     assert [row.label for row in table.rows] == ["model.edm=true", "model.edm=false"]
@@ -217,11 +219,11 @@ def test_a_job_that_is_there_twice_counts_once(sweep):
 
 
 def test_settings_that_turn_out_to_be_the_same_run_each_keep_their_row(sweep):
-    folder = sweep.run(None, {"mpjpe": 60.0}, overrides=("data.num_points=512",))
-    sweep.job(None, overrides=("data.num_points=512.0",), run_dir=str(folder))
+    folder = sweep.run(None, {"mpjpe": 60.0}, overrides=("data.num_test=512",))
+    sweep.job(None, overrides=("data.num_test=512.0",), run_dir=str(folder))
     sweep.job("detector/cross_0px", run_dir=str(folder), status="failed")
     rows = cells(sweep.write())
-    assert rows["data.num_points=512"].cells[0].mean == rows["data.num_points=512.0"].cells[0].mean == 60.0
+    assert rows["data.num_test=512"].cells[0].mean == rows["data.num_test=512.0"].cells[0].mean == 60.0
     assert rows["detector/cross_0px"].status == "failed"
 
 

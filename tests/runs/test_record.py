@@ -98,13 +98,13 @@ def test_the_identity_ignores_paths_loggers_and_workers(compose_config):
         "group=sweep",
         "num_threads=3",
         "preset.name=other",
-        "data.keypoint_noise_px=10.0",
+        "data.synthesis.keypoint_noise_px=10.0",
         "data.source.path=the_same_content_elsewhere.npz",
     ):
         assert hash_of(override) == same, override
     for override in (
         "seed=1",
-        "data.keypoint_noise_px=5",
+        "data.synthesis.keypoint_noise_px=5",
         "preset.num_points=512",
         "model.edm=false",
         "module.optimizer.lr=0.1",

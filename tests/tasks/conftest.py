@@ -76,7 +76,8 @@ def write_checkpoint(smoke_config, tmp_path_factory):
         content = {"state_dict": module.state_dict(), "epoch": 0}
         config = OmegaConf.to_container(cfg, resolve=True)
         body_hash = "-".join(sorted({*data_hashes, *module.body_hashes}))
-        Provenance(config, body_hash, "none", experiment).on_save_checkpoint(None, module, content)
+        recipe = build(cfg.data).recipe
+        Provenance(config, body_hash, "none", experiment, recipe).on_save_checkpoint(None, module, content)
         path = directory / f"{experiment.replace('/', '_')}.ckpt"
         torch.save(content, path)
         return path

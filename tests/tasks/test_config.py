@@ -5,7 +5,9 @@ import pytest
 from hydra.errors import ConfigCompositionException
 from omegaconf import OmegaConf, open_dict
 
+from datamodules.synthesis import SynthesisSettings
 from ljn.building import build, build_each, check_targets
+from ljn.cloud.observation import ObservationRecipe
 from ljn.tasks.validation import check_writable, validate
 
 CONF = Path(__file__).parents[2] / "conf"
@@ -84,7 +86,7 @@ def test_the_cosine_of_the_small_preset_ends_with_the_training(compose_config):
 
 def test_the_thesis_preset_holds_the_specs_numbers(compose_config):
     cfg = compose_config("preset=thesis", "experiment=detector/proposed")
-    assert (cfg.data.num_points, cfg.data.num_train, cfg.data.num_val, cfg.data.num_test) == (
+    assert (cfg.data.observation.num_points, cfg.data.num_train, cfg.data.num_val, cfg.data.num_test) == (
         4096,
         60000,
         5000,
@@ -93,7 +95,7 @@ def test_the_thesis_preset_holds_the_specs_numbers(compose_config):
     assert cfg.model.group_size == 128
     assert cfg.module.optimizer._target_ == "torch.optim.RAdam"
     assert (cfg.module.scheduler.step_size, cfg.module.scheduler.gamma) == (5, 0.1)
-    assert cfg.data.normals == "knn"
+    assert cfg.data.observation.normals == "knn"
 
 
 def test_a_misspelt_key_is_rejected(compose_config):
@@ -114,14 +116,17 @@ def test_a_value_of_the_wrong_type_is_rejected(compose_config):
             r"model\.radii_m: expected 24 radii, one for each joint \(pelvis.*got 2",
         ),
         (["model.radii_m=0.2"], r"model\.radii_m: expected 24 radii.*got 0\.2"),
-        (["data.num_points=0"], r"data\.num_points: expected an integer of 1 or more, got 0"),
+        (
+            ["data.observation.num_points=0"],
+            r"data\.observation\.num_points: expected an integer of 1 or more, got 0",
+        ),
         (["data.batch_size=null"], r"data\.batch_size: expected an integer of 1 or more, got None"),
         (["data.num_workers=-1"], r"data\.num_workers: expected an integer of 0 or more, got -1"),
         (["data.eval_seed=-1"], r"data\.eval_seed: expected an integer of 0 or more, got -1"),
         (
-            ["experiment=mesh/proposed", "data.num_points=100"],
-            r"preset\.mesh\.num_centres\): expected at most data\.num_points=100 .*got \[128, 32\]; set "
-            r"data\.num_points=128 or more, or preset\.mesh\.num_centres=\[100,32\]",
+            ["experiment=mesh/proposed", "data.observation.num_points=100"],
+            r"preset\.mesh\.num_centres\): expected at most data\.observation\.num_points=100 .*got \[128, 32\]; set "
+            r"data\.observation\.num_points=128 or more, or preset\.mesh\.num_centres=\[100,32\]",
         ),
         (
             ["experiment=mesh/basic", "preset.mesh.num_centres=[16,32]"],
@@ -170,11 +175,11 @@ def test_what_types_cannot_say_is_validated(overrides, message, compose_config, 
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("data.distance_m=2", "distance_m: expected two numbers, nearest and farthest, got 2"),
-        ("data.distance_m=[1.5]", "distance_m: expected two numbers"),
-        ("data.distance_m=[3,1]", "distance_m: expected 0 < nearest <= farthest"),
-        ("data.depth_noise_m=nan", "depth_noise_m: expected a number of 0 or more, got nan"),
-        ("data.margin_px=300", "margin_px: a clear border of 300"),
+        ("data.synthesis.distance_m=2", "distance_m: expected two numbers, nearest and farthest, got 2"),
+        ("data.synthesis.distance_m=[1.5]", "distance_m: expected two numbers"),
+        ("data.synthesis.distance_m=[3,1]", "distance_m: expected 0 < nearest <= farthest"),
+        ("data.synthesis.depth_noise_m=nan", "depth_noise_m: expected a number of 0 or more, got nan"),
+        ("data.synthesis.margin_px=300", "margin_px: a clear border of 300"),
     ],
 )
 def test_bad_values_of_the_data_are_named_when_it_is_built(override, message, compose_config):
@@ -214,11 +219,17 @@ def test_a_target_cannot_reach_code_outside_the_allow_list(target):
 
 
 def test_an_error_in_a_constructor_keeps_its_type_and_message(compose_config):
-    cfg = compose_config("data.heading=sideways")
+    cfg = compose_config("data.synthesis.heading=sideways")
     with pytest.raises(
         ValueError, match="heading: expected one of source, histogram, uniform, got 'sideways'"
     ):
         build(cfg.data)
+
+
+def test_settings_objects_have_the_defaults_of_their_yaml(compose_config):
+    data = compose_config("preset=thesis").data
+    assert build(data.synthesis) == SynthesisSettings()
+    assert build(data.observation) == ObservationRecipe(normals="knn")
 
 
 def test_no_config_reaches_an_object(compose_config, tmp_path):
@@ -227,7 +238,15 @@ def test_no_config_reaches_an_object(compose_config, tmp_path):
     cfg = compose_config("experiment=detector/proposed", f"paths.run_dir={tmp_path}", "tags=[a,b]")
     module = build(cfg.module)
     datamodule = build(cfg.data)
-    parts = [*build_each(cfg.callbacks), *build_each(cfg.logger), datamodule.settings.camera]
-    for owner in (module, module.net, datamodule, datamodule.settings, datamodule.source, *parts):
+    parts = [*build_each(cfg.callbacks), *build_each(cfg.logger), datamodule.camera]
+    for owner in (
+        module,
+        module.net,
+        datamodule,
+        datamodule.synthesis,
+        datamodule.observation,
+        datamodule.source,
+        *parts,
+    ):
         for name, value in vars(owner).items():
             assert not isinstance(value, DictConfig | ListConfig), name

@@ -44,7 +44,7 @@ def test_a_row_is_configured_as_the_experiment_that_it_trains(run_py, tmp_path):
     [
         ("data.keypoint_noise=5", "has no key 'data.keypoint_noise'"),
         ("model.edm=false", "come from the checkpoint"),
-        ("data.keypoint_noise_px=-1", "keypoint_noise_px: expected a number of 0 or more"),
+        ("data.synthesis.keypoint_noise_px=-1", "keypoint_noise_px: expected a number of 0 or more"),
     ],
 )
 def test_a_mistake_in_the_changes_is_an_error_before_the_training(smoke_config, tmp_path, override, message):

@@ -43,7 +43,7 @@ def test_several_checkpoints_go_in_one_multirun_with_other_noise(trained, run_py
             f"ckpt_path={checkpoints[0]},{checkpoints[1]}",
             f"paths.output_dir={tmp_path}",
         ),
-        *("data.keypoint_noise_px=15", "logger=csv"),
+        *("data.synthesis.keypoint_noise_px=15", "logger=csv"),
     )
     assert "2 jobs: 0 runs, 2 evaluations" in done.stdout
     [sweep] = (tmp_path / "sweeps").iterdir()
@@ -137,18 +137,24 @@ def test_overrides_change_data_and_nothing_that_the_checkpoint_decides(trained, 
     checkpoint = read_checkpoint(trained[1] / "checkpoints" / "best.ckpt")
     cfg = evaluation(smoke_config, trained, tmp_path)
     merged = with_checkpoint_config(
-        cfg, checkpoint, ["task=evaluate", "data.keypoint_noise_px=15", "logger=csv"]
+        cfg, checkpoint, ["task=evaluate", "data.synthesis.keypoint_noise_px=15", "logger=csv"]
     )
-    assert merged.data.keypoint_noise_px == 15
-    assert merged.data.num_points == 128
+    assert merged.data.synthesis.keypoint_noise_px == 15
+    assert merged.data.observation.num_points == 128
     refused = ("model.edm=false", "preset=thesis", "experiment=detector/basic", "data=synthetic", "seed=3")
-    for override in (*refused, "data/source=embedded", "~data.distance_m", "+data.more=1", "sweep=demo"):
+    for override in (
+        *refused,
+        "data/source=embedded",
+        "~data.synthesis.distance_m",
+        "+data.more=1",
+        "sweep=demo",
+    ):
         with pytest.raises(ValueError, match="come from the checkpoint"):
             with_checkpoint_config(cfg, checkpoint, [override])
     with pytest.raises(ValueError, match=r"'data\.source' holds several values"):
         with_checkpoint_config(cfg, checkpoint, ["data.source=null"])
-    with pytest.raises(ValueError, match=r"no key 'data\.num_pionts'; known there: .*num_points"):
-        with_checkpoint_config(cfg, checkpoint, ["data.num_pionts=3"])
+    with pytest.raises(ValueError, match=r"no key 'data\.num_tset'; known there: .*num_test"):
+        with_checkpoint_config(cfg, checkpoint, ["data.num_tset=3"])
 
 
 def test_other_bodies_reach_all_that_was_made_of_the_bodies_group(write_checkpoint, smoke_config, tmp_path):

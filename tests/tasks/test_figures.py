@@ -44,7 +44,7 @@ def test_noise_is_given_to_each_detector(config, checkpoints, write_checkpoint, 
 
 
 def test_what_is_typed_changes_the_data_of_all_columns(config, checkpoints, tmp_path, monkeypatch):
-    typed = ["task=figures", "data.joint_noise_m=0.05"]
+    typed = ["task=figures", "data.synthesis.joint_noise_m=0.05"]
     monkeypatch.setattr("ljn.tasks.figures.typed_overrides", lambda: typed)
     figures(config(regressors=[checkpoints[1]]))
     assert read_page(tmp_path, "meshes")[0]["title"] == "mesh/proposed, 0.05 m"

@@ -162,7 +162,7 @@ def test_nothing_is_loaded_before_the_cheap_checks(config, folders, monkeypatch,
 
 
 def test_the_model_and_data_of_the_configuration_do_not_matter(config):
-    broken = config("mesh_ckpt_path=null", "model.radii_m=[1]", "data.num_points=0")
+    broken = config("mesh_ckpt_path=null", "model.radii_m=[1]", "data.observation.num_points=0")
     assert predict(broken) == {"predict/frames": 1}
 
 
@@ -197,8 +197,9 @@ def test_checkpoints_of_different_bodies_are_refused(checkpoints, tmp_path):
 
 def test_the_pipeline_takes_points_and_normals_from_the_checkpoints(checkpoints):
     pipeline = Pipeline.load(*checkpoints)
-    assert (pipeline.detector.cloud.num_points, pipeline.detector.cloud.normals) == (128, "window")
-    assert pipeline.detector.cloud.spacing_m == pytest.approx(1.5 / 366.458)
+    recipe = pipeline.detector.recipe
+    assert (recipe.num_points, recipe.normals) == (128, "window")
+    assert recipe.spacing_m == pytest.approx(1.5 / 366.458)
     assert not pipeline.regressor.module.training
 
 

@@ -49,7 +49,7 @@ def test_a_run_leaves_its_files(trained):
     assert set(record["data"]["bodies"]) == {"female", "male"}
     assert set(record["data"]["pool"]) == {"train", "val", "test"}
     assert record["data"]["seeds"] == {"seed": 0, "pool_seed": 0, "eval_seed": 0}
-    assert OmegaConf.load(run_dir / "config.yaml").data.num_points == 128
+    assert OmegaConf.load(run_dir / "config.yaml").data.observation.num_points == 128
     assert (run_dir / "checkpoints" / "best.ckpt").is_file()
     assert sorted(path.name for path in (run_dir / "pictures").iterdir()) == [
         "test_best_median_worst.png",
@@ -153,7 +153,7 @@ def test_a_yardstick_is_fitted_without_validation_too(smoke_config, tmp_path):
     [
         ("body.path=missing.npz", FileNotFoundError, "missing.npz"),
         ("data.source.path=missing.npz", FileNotFoundError, "missing.npz"),
-        ("data.margin_px=300", ValueError, "margin_px"),
+        ("data.synthesis.margin_px=300", ValueError, "margin_px"),
     ],
 )
 def test_bad_input_ends_a_run_before_it_starts(override, error, message, smoke_config, tmp_path):

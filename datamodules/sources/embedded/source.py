@@ -7,23 +7,13 @@ from dataclasses import asdict
 from functools import cached_property
 from pathlib import Path
 
-import numpy as np
-import torch
-
-from datamodules.sources import SPLITS, PoseRecords
+from datamodules.sources import PoseRecords
 from datamodules.sources.clips import Clips, read_clips, read_split
-from datamodules.sources.embedded.joint_limits import with_square_elbows
-from datamodules.sources.embedded.mixture import MixtureSettings, PoseMixture
-from datamodules.sources.embedded.recombination import Made, clip_donors
+from datamodules.sources.embedded.mixture import MixtureSettings
+from datamodules.sources.embedded.records import POSES_VERSION, ClipMixture
 from ljn.body import GENDERS, BodyModel, load_body_model
-from ljn.body.skeleton import NUM_JOINTS
-from ljn.data import EMBEDDED_DATA_VERSION
-from ljn.geometry.rotations import rotmat_to_rotvec, rotvec_to_rotmat, smpl_pose_to_body_world
 
 _DATA = Path(__file__).parent / "data"
-_FIRST_BATCH, _LARGEST_BATCH = 128, 2048  # each is twice the one before: small requests are quick as well
-_POSES, _SHAPES = range(2)  # streams of a batch
-_DECIMALS = 5  # radians; turns the farthest vertex by 0.02 mm
 
 SHARES: Mapping[str, float] = {"whole": 0.30, "swapped": 0.20, "mixed": 0.20, "procedural": 0.30}
 FAMILY_SHARES: Mapping[str, float] = {
@@ -44,9 +34,7 @@ class EmbeddedSource:
     "one+other" for a part between two donors; or "proc/" and a family. `frame` is the frame of the (legs') clip, -1
     without one.
 
-    Records come in batches with streams of their own, so a longer request begins with the records of a shorter one.
-    All is computed in float64 and poses are rounded to 1e-5 radians: machines whose sines differ in the last bit still
-    give equal records and an equal `PoseRecords.hash`, but for the rare value that lies just between two steps.
+    How records are drawn is `ClipMixture`'s.
 
     Args:
         jitter_deg: Standard deviation of the jitter of whole and recombined poses about each axis, degrees.
@@ -63,6 +51,7 @@ class EmbeddedSource:
     """
 
     name = "embedded"
+    version = POSES_VERSION
     licence = (
         "Motion clips of DeepMimic (from pybullet, zlib licence) and the CMU Graphics Lab Motion Capture "
         "Database (free for research and commercial use); see NOTICE"
@@ -100,7 +89,6 @@ class EmbeddedSource:
             self.name = f"clips of {self.path.name}"
             self.licence = f"the user's own file {self.path.name}; its licence is not known here"
         self.split_path = Path(split_path or _DATA / "embedded_split.json")
-        self._mixtures: dict[str, PoseMixture] = {}
 
     def check(self) -> None:
         """Read the files; see `PoseSource.check`."""
@@ -110,7 +98,7 @@ class EmbeddedSource:
     def fingerprint(self) -> str:
         """See `PoseSource.fingerprint`."""
         settings = asdict(self.settings) | {
-            "version": EMBEDDED_DATA_VERSION,
+            "version": self.version,
             "body": self._body.hash,
             "max_beta": self.max_beta,
             "genders": self.genders,
@@ -132,55 +120,15 @@ class EmbeddedSource:
         """Whatever bodies the poses are worn by, they are made on one."""
         return load_body_model()
 
+    @cached_property
+    def mixture(self) -> ClipMixture:
+        """The clips, mixed."""
+        return ClipMixture(self._clips, self._split, self.settings, self._body, self.max_beta, self.genders)
+
     def motion(self, split: str) -> dict[str, int]:
-        """See `PoseSource.motion`: the clips that a frame or a part of a pose can come from."""
-        if not any(share for kind, share in self.settings.shares.items() if kind != "procedural"):
-            return {"clips": 0, "frames": 0}
-        return {"clips": len(self._split[split]), "frames": int(self._is_donor(split).sum())}
-
-    def _is_donor(self, split: str) -> np.ndarray:
-        """Whether each frame belongs to a split."""
-        return np.isin(self._clips.clip, self._split[split])
-
-    def mixture(self, split: str) -> PoseMixture:
-        """The mixture of a split (one of `SPLITS`), whose donors are that split's clips."""
-        if split not in SPLITS:
-            raise ValueError(f"split: expected one of {', '.join(SPLITS)}, got '{split}'")
-        if not self._split[split]:
-            raise ValueError(f"split: {self.split_path} lists no clips for '{split}'")
-        if split not in self._mixtures:
-            is_donor = self._is_donor(split)
-            rotvec = torch.from_numpy(self._clips.poses[is_donor]).double().unflatten(-1, (NUM_JOINTS, 3))
-            rotmat = with_square_elbows(rotvec_to_rotmat(rotvec))
-            donors = clip_donors(rotmat, self._clips.clip[is_donor])
-            self._mixtures[split] = PoseMixture(self.settings, donors, self._body)
-        return self._mixtures[split]
+        """See `PoseSource.motion`."""
+        return self.mixture.motion(split)
 
     def records(self, split: str, num_records: int, seed: int) -> PoseRecords:
         """See `PoseSource.records`."""
-        mixture = self.mixture(split)
-        batches: list[tuple[np.ndarray, ...]] = []
-        size, num_drawn = _FIRST_BATCH, 0
-        while not batches or num_drawn < num_records:
-            batches.append(self._batch(mixture, [seed, SPLITS.index(split), len(batches)], size))
-            num_drawn += size
-            size = min(2 * size, _LARGEST_BATCH)
-        columns = [np.concatenate(column)[:num_records] for column in zip(*batches)]
-        pose, betas, gender, sequence, frame = columns
-        return PoseRecords(pose, betas, gender, sequence.astype(str), frame, has_heading=False)
-
-    def _batch(self, mixture: PoseMixture, key: list[int], size: int) -> tuple[np.ndarray, ...]:
-        """The columns of `size` records, but for `has_heading`."""
-        made = mixture.draw(np.random.default_rng([*key, _POSES]), size)
-        rng = np.random.default_rng([*key, _SHAPES])
-        gender = rng.choice([GENDERS[name] for name in self.genders], size)
-        betas = rng.standard_normal((size, 10))
-        while (outside := np.abs(betas) > self.max_beta).any():
-            betas[outside] = rng.standard_normal(np.count_nonzero(outside))
-        return _to_pose(made), betas.astype(np.float32), gender, made.name, made.frame
-
-
-def _to_pose(made: Made) -> np.ndarray:
-    """Poses `(n, 72)` float32 in body world, in steps of 1e-5 radians."""
-    pose = smpl_pose_to_body_world(rotmat_to_rotvec(made.rotmat).flatten(-2))
-    return pose.numpy().round(_DECIMALS).astype(np.float32)
+        return self.mixture.records(split, num_records, seed)

@@ -154,7 +154,7 @@ def test_upper_arms_keep_out_of_the_back_and_the_far_side(side):
 
 
 def test_real_poses_are_hardly_touched():
-    donors = EmbeddedSource().mixture("test").donors.rotmat
+    donors = EmbeddedSource().mixture.of("test").donors.rotmat
     moved = rotmat_to_rotvec(donors.mT @ within_limits(donors)).norm(dim=-1).rad2deg()
     assert (moved > 5).any(1).double().mean() < 0.15
     assert moved.mean() < 0.3

@@ -25,7 +25,7 @@ def make(source, body):
             "jitter_deg": 4.0,
             "max_penetration_m": 0.05,
         }
-        return PoseMixture(MixtureSettings(**{**settings, **changes}), source.mixture("val").donors, body)
+        return PoseMixture(MixtureSettings(**{**settings, **changes}), source.mixture.of("val").donors, body)
 
     return mixture
 
@@ -75,7 +75,7 @@ def test_only_what_has_a_share_is_drawn(make):
 
 
 def test_frames_are_those_of_the_legs_and_minus_one_without_a_clip(drawn, source):
-    donors = source.mixture("val").donors
+    donors = source.mixture.of("val").donors
     lengths = {name: int(donors.frame[donors.name == name].max()) + 1 for name in np.unique(donors.name)}
     for name, frame in zip(drawn.name, drawn.frame):
         legs = name.split("|")[0]
