@@ -3,7 +3,7 @@
 python run.py --help                                       the configuration and its groups
 python run.py experiment=detector/proposed                 train, then test the best checkpoint
 python run.py task=evaluate ckpt_path=CHECKPOINT           test a checkpoint
-python run.py task=predict input=DEPTH.png ...             joints and mesh of a depth image
+python run.py task=predict task.input=DEPTH.png ...        joints and mesh of a depth image
 """
 
 import logging
@@ -14,7 +14,8 @@ import hydra
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from ljn.tasks.processes import is_first_process, is_job_of_sweep
+from ljn.tasks.arguments import prepare_arguments
+from ljn.tasks.processes import is_first_process, is_job_of_sweep, sweep_name
 from ljn.tasks.schema import register
 
 register()
@@ -26,8 +27,6 @@ def main(cfg: DictConfig) -> float | None:
     if not is_first_process():
         logging.disable(logging.INFO)  # the first process says it for all
     if cfg.group is None and is_job_of_sweep():
-        from callbacks.sweep_report import sweep_name  # not above: --help should stay quick
-
         cfg.group = sweep_name(HydraConfig.get())
     try:
         metrics = hydra.utils.get_method(cfg.task._target_)(cfg)
@@ -43,4 +42,8 @@ def main(cfg: DictConfig) -> float | None:
 
 
 if __name__ == "__main__":
+    try:
+        sys.argv[1:] = prepare_arguments(sys.argv[1:])
+    except ValueError as error:
+        sys.exit(f"error: {error}")
     main()

@@ -16,6 +16,7 @@ from omegaconf import DictConfig
 from ljn.report import write_report
 from ljn.runs.files import read_json, write_json
 from ljn.runs.sweep import settings
+from ljn.tasks.processes import sweep_name
 
 
 class SweepReport(Callback):
@@ -131,15 +132,6 @@ class SweepReport(Callback):
     def _relative(self, run_dir: str | None) -> str | None:
         """A run's directory as seen from `output_dir`, so that the whole output can be moved."""
         return None if run_dir is None else os.path.relpath(run_dir, self.output_dir)
-
-
-def sweep_name(hydra: Any) -> str:
-    """What a multirun is called: a grid of the user's own has no name but the time of its start.
-
-    Args:
-        hydra: Hydra's own part of the configuration.
-    """
-    return hydra.runtime.choices.get("sweep") or f"grid-{Path(hydra.sweep.dir).name}"
 
 
 def _row(job: dict[str, Any], preset: str) -> tuple[Any, ...]:

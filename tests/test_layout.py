@@ -29,7 +29,10 @@ def imports(path):
             yield from (f"{node.module}.{alias.name}" for alias in node.names)
 
 
-FILES = [ROOT / "run.py", *(path for top in ("ljn", "datamodules", "callbacks") for path in (ROOT / top).rglob("*.py"))]
+FILES = [
+    ROOT / "run.py",
+    *(path for top in ("ljn", "datamodules", "callbacks") for path in (ROOT / top).rglob("*.py")),
+]
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(ROOT)))

@@ -16,11 +16,10 @@ from ljn.building import build
 from ljn.cloud.observation import ObservationRecipe
 from ljn.modules.base import StageModule
 from ljn.reading import READ_ERRORS
+from ljn.runs.keys import CONFIG_GROUPS
 
 CHECKPOINT_VERSION = 3
 _PROVENANCE_KEY = "ljn"
-CONFIG_GROUPS = ("preset", "model", "module", "data", "body", "trainer", "seed", "name", "optimized_metric")
-"""The part of a stored configuration that decides what a checkpoint is."""
 
 
 class Provenance(Callback):

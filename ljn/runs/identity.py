@@ -11,44 +11,35 @@ from typing import Any
 from omegaconf import DictConfig, OmegaConf, open_dict
 
 from ljn.runs.files import map_floats
-
-# What may differ between two runs that are the same run; what data files hold is in the data's fingerprint.
-_NOT_IDENTITY: dict[str, tuple[str, ...]] = {
-    "data": ("source", "cache_dir", "num_workers", "prefetch_batches", "body_path", "detector_ckpt"),
-    "module": ("body_path",),
-    "callbacks": ("progress", "errors", "pictures"),
-    "trainer": (
-        "accelerator",
-        "devices",
-        "strategy",
-        "enable_model_summary",
-        "log_every_n_steps",
-        "profiler",
-    ),
-}
+from ljn.runs.keys import Key, kind_of
 
 
 def identity(cfg: DictConfig, data_fingerprint: str) -> dict[str, Any]:
     """Everything that a run's numbers depend on, as plain values.
 
+    That is the value of every key that `ljn.runs.keys` gives to the run. Nulls are left out at any depth: what is not
+    set does not count, so that a key added later, null by default, changes no run's identity.
+
     Args:
         cfg: The composed configuration.
-        data_fingerprint: See `BodyDataModule.fingerprint`.
+        data_fingerprint: Of what the data's files hold, which their names do not say; see `BodyDataModule`.
     """
     cfg = cfg.copy()
     with open_dict(cfg):
         cfg.paths.run_dir = ""  # named by what comes of this
-    plain: dict[str, Any] = OmegaConf.to_container(cfg, resolve=True)  # type: ignore[assignment]
-    kept: dict[str, Any] = {"seed": plain["seed"], "data_fingerprint": data_fingerprint}
-    kept |= {"predicted_body": predicted_body(cfg)}
-    # Callbacks: what chooses the best epoch, or ends a training.
-    for group in ("data", "model", "module", "trainer", "callbacks"):
-        dropped = _NOT_IDENTITY.get(group, ())
-        content = plain[group] or {}
-        kept[group] = {
-            key: value for key, value in content.items() if key not in dropped and value is not None
-        }
-    return kept
+    kept: dict[str, Any] = _of_run(OmegaConf.to_container(cfg, resolve=True))
+    return kept | {"data_fingerprint": data_fingerprint, "predicted_body": predicted_body(cfg)}
+
+
+def _of_run(value: Any, key: str = "") -> Any:
+    """What of a value is the run's; None and empty groups are nothing."""
+    if isinstance(value, Mapping):
+        kept = {name: _of_run(entry, f"{key}.{name}".lstrip(".")) for name, entry in value.items()}
+        return {name: entry for name, entry in kept.items() if entry not in (None, {})}
+    if Key.RUN not in kind_of(key):
+        return None
+    # In a list every place counts.
+    return [_of_run(entry, key) for entry in value] if isinstance(value, list) else value
 
 
 def predicted_body(cfg: DictConfig) -> str | None:

@@ -13,17 +13,9 @@ import yaml
 
 from ljn.reading import READ_ERRORS
 from ljn.runs.files import read_json
+from ljn.runs.keys import key_of, kind_of
 
 Status = Literal["complete", "failed", "missing"]
-
-# Overrides that say nothing about what a run is: what a row is called, what it is averaged over, and what is the
-# machine's or the tracker's.
-_NOT_A_SETTING = (
-    "experiment", "seed", "sweep", "tables", "name", "group", "tags", "rerun", "num_threads", "local", "hydra",
-    "paths", "logger", "callbacks.pictures", "callbacks.progress", "callbacks.errors", "data.cache_dir",
-    "data.num_workers", "data.prefetch_batches", "trainer.accelerator", "trainer.devices", "trainer.strategy",
-    "trainer.enable_model_summary", "trainer.log_every_n_steps", "trainer.profiler",
-)  # fmt: skip
 
 
 def settings(overrides: Iterable[str], preset: str) -> tuple[str, ...]:
@@ -35,10 +27,8 @@ def settings(overrides: Iterable[str], preset: str) -> tuple[str, ...]:
     """
     kept = []
     for override in overrides:
-        key, _, value = override.partition("=")
-        key = key.lstrip("+~").replace("/", ".")
-        is_setting = not any(key == name or key.startswith(f"{name}.") for name in _NOT_A_SETTING)
-        if is_setting and (key, value) != ("preset", preset):
+        key = key_of(override)
+        if kind_of(key).is_setting and (key, override.partition("=")[2]) != ("preset", preset):
             kept.append(override)
     return tuple(sorted(kept))
 

@@ -4,19 +4,15 @@ from pathlib import Path
 from typing import Any
 
 from hydra import compose
-from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf, open_dict
 
 from ljn.building import build
-from ljn.tasks.evaluate import apply_overrides, evaluate_checkpoint, typed_overrides
+from ljn.runs.keys import key_of, kind_of
+from ljn.tasks.arguments import quoted
+from ljn.tasks.evaluate import evaluate_checkpoint
+from ljn.tasks.overrides import apply_overrides, typed_overrides
 from ljn.tasks.train import train
 from ljn.tasks.validation import validate
-
-# Of what was typed, what means the detector, too; of a sweep, the sizes that it sets.
-_SHARED = (
-    "sweep=", "preset", "seed=", "body", "data", "trainer", "paths", "logger", "num_threads=", "tags=", "group=",
-)  # fmt: skip
-_OF_STAGE_2 = ("data.synthesis.initial_joints", "data.synthesis.joint_noise", "data.detector_ckpt")
 
 
 def cross(cfg: DictConfig) -> dict[str, float]:
@@ -49,7 +45,7 @@ def cross(cfg: DictConfig) -> dict[str, float]:
     build(changed.data)
     if task.detector is not None:
         detector = _trained(_composed(task.detector), task.detector)
-        overrides.append(f"data.detector_ckpt='{detector}'")
+        overrides.append(f"data.detector_ckpt={quoted(detector)}")
     return evaluate_checkpoint(cfg, _trained(cfg.copy(), task.trains), overrides, cfg.name, reuses=True)
 
 
@@ -61,7 +57,7 @@ def _check_trains(cfg: DictConfig) -> None:
     typed = typed_overrides()
     if not typed:
         return
-    typed = [line for line in typed if not line.startswith(("experiment=", "name=", "task"))]
+    typed = [line for line in typed if key_of(line).split(".")[0] not in ("experiment", "name", "task")]
     trained = compose("config", [f"experiment={cfg.task.trains}", *typed])
     for group in ("model", "module", "data", "trainer"):
         if trained[group] != cfg[group]:
@@ -82,6 +78,5 @@ def _trained(cfg: DictConfig, name: str) -> Path:
 
 def _composed(experiment: str) -> DictConfig:
     """The configuration of another experiment with this call's sizes, data, trainer and the like."""
-    typed = HydraConfig.get().overrides.task
-    kept = [line for line in typed if line.startswith(_SHARED) and not line.startswith(_OF_STAGE_2)]
+    kept = [line for line in typed_overrides() if kind_of(key_of(line)).is_shared]
     return compose("config", [f"experiment={experiment}", *kept])

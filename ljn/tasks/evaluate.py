@@ -2,46 +2,22 @@
 
 import logging
 from pathlib import Path
-from typing import Any
 
 import torch
-from hydra.core.hydra_config import HydraConfig
-from hydra.core.override_parser.overrides_parser import OverridesParser
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
-from ljn.building import build, check_targets
+from ljn.building import build
 from ljn.data import BodyDataModule
-from ljn.runs.checkpoints import CONFIG_GROUPS, Checkpoint, load_state, read_checkpoint
+from ljn.runs.checkpoints import Checkpoint, load_state, read_checkpoint
 from ljn.runs.files import read_json, write_json
 from ljn.runs.identity import config_hash, identity
 from ljn.runs.record import RunRecord, alone_in, is_complete
+from ljn.tasks.overrides import check_bodies, typed_overrides, with_checkpoint_config
+from ljn.tasks.running import build_trainer, finite_metrics, prepare_process, save_config, set_run_directory
 from ljn.tasks.tracking import tracking
-from ljn.tasks.train import (
-    build_trainer,
-    finite_metrics,
-    prepare_process,
-    save_config,
-    set_run_directory,
-)
 from ljn.tasks.validation import validate
 
 _LOG = logging.getLogger(__name__)
-
-# Of `CONFIG_GROUPS`, which the checkpoint decides: those whose single values a call may change.
-_OVERRIDABLE = ("data", "trainer", "body")
-# What the checkpoint has no say in.
-_FROM_CALL = (
-    "task",
-    "callbacks",
-    "logger",
-    "paths",
-    "hydra",
-    "num_threads",
-    "ckpt_path",
-    "rerun",
-    "tags",
-    "group",
-)
 
 
 def evaluate(cfg: DictConfig) -> dict[str, float]:
@@ -63,11 +39,6 @@ def evaluate(cfg: DictConfig) -> dict[str, float]:
     if cfg.ckpt_path is None:
         raise ValueError("ckpt_path: expected the checkpoint to evaluate, got null; add ckpt_path=FILE")
     return evaluate_checkpoint(cfg, cfg.ckpt_path, typed_overrides())
-
-
-def typed_overrides() -> list[str]:
-    """What was typed after `run.py`; nothing in a process that Hydra did not start."""
-    return list(HydraConfig.get().overrides.task) if HydraConfig.initialized() else []
 
 
 def evaluate_checkpoint(
@@ -128,90 +99,3 @@ def _evaluate(
             write_json(run_dir / "metrics.json", metrics)
     _LOG.info("%s on %s: %s", checkpoint.run, cfg.name, run_dir)
     return metrics
-
-
-def check_bodies(checkpoint: Checkpoint, hashes: set[str]) -> None:
-    """Raise a `ValueError` unless a checkpoint was trained with the bodies of these hashes."""
-    if unknown := checkpoint.unknown_bodies(hashes):
-        raise ValueError(
-            f"body: the checkpoint was trained with the bodies {checkpoint.body_hash}; {unknown[0]} is not among "
-            "them. A model is only meaningful with its bodies: name them with body.path=FILE_OR_FOLDER and "
-            "body.genders"
-        )
-
-
-def with_checkpoint_config(cfg: DictConfig, checkpoint: Checkpoint, overrides: list[str]) -> DictConfig:
-    """The call's configuration with the checkpoint's model, data and trainer, and the overrides on top.
-
-    Args:
-        cfg: The call's composed configuration.
-        checkpoint: The checkpoint.
-        overrides: The call's overrides, as they were typed.
-
-    Raises:
-        ValueError: An override is about something that the checkpoint decides.
-    """
-    check_targets({name: checkpoint.config.get(name) for name in CONFIG_GROUPS}, "the checkpoint's config")
-    plain: dict[str, Any] = OmegaConf.to_container(cfg, resolve=False)  # type: ignore[assignment]
-    # What belongs to the machine rather than to the numbers stays this call's.
-    of_machine = {
-        "data": {name: plain["data"][name] for name in ("cache_dir", "num_workers", "prefetch_batches")},
-        "trainer": {name: plain["trainer"][name] for name in ("accelerator", "devices", "strategy")},
-    }
-    plain |= {name: checkpoint.config[name] for name in CONFIG_GROUPS}
-    plain |= {name: {**plain[name], **values} for name, values in of_machine.items()}
-    merged = OmegaConf.create(plain)
-    OmegaConf.set_struct(merged, True)
-    apply_overrides(merged, overrides)
-    return merged
-
-
-def apply_overrides(cfg: DictConfig, overrides: list[str]) -> None:
-    """Change single values of data, trainer and body in a resolved configuration.
-
-    Args:
-        cfg: What a checkpoint's configuration is part of.
-        overrides: As they would be typed; those about what the checkpoint has no say in are left out.
-
-    Raises:
-        ValueError: An override is about something that the checkpoint decides, or names no value.
-    """
-    for override in OverridesParser.create().parse_overrides(overrides):
-        key = override.key_or_group.replace("/", ".")
-        group = key.split(".")[0]
-        if group in _FROM_CALL:
-            continue
-        is_value = "/" not in override.key_or_group and not (override.is_delete() or override.is_add())
-        if group not in _OVERRIDABLE or "." not in key or not is_value:
-            raise ValueError(
-                f"{override.input_line}: model, data and sizes come from the checkpoint; an evaluation can "
-                f"change single values of {', '.join(_OVERRIDABLE)} (data.synthesis.keypoint_noise_px=15) and choose "
-                "callbacks, logger and paths"
-            )
-        _set(cfg, key, override.value(), override.input_line)
-
-
-def _set(cfg: DictConfig, key: str, value: Any, line: str | None) -> None:
-    current = OmegaConf.select(cfg, key, default=_MISSING)
-    if isinstance(current, DictConfig):
-        raise ValueError(
-            f"{line}: '{key}' holds several values; change one of them: {', '.join(map(str, current))}"
-        )
-    if current is _MISSING:
-        parent = OmegaConf.select(cfg, key.rpartition(".")[0])
-        known = ", ".join(sorted(str(name) for name in parent)) if isinstance(parent, DictConfig) else "none"
-        raise ValueError(f"{line}: the checkpoint's config has no key '{key}'; known there: {known}")
-    OmegaConf.update(cfg, key, value)
-    if key.startswith("body."):
-        # The stored config is resolved: what was derived from the body's group has to follow by hand.
-        for derived in _OF_BODY[key]:
-            if OmegaConf.select(cfg, derived, default=_MISSING) is not _MISSING:
-                OmegaConf.update(cfg, derived, value)
-
-
-_OF_BODY = {
-    "body.path": ("data.body_path", "module.body_path"),
-    "body.genders": ("data.source.genders", "module.genders"),
-    "body.predicted": ("module.predicted",),
-}
-_MISSING = object()

@@ -17,8 +17,8 @@ from ljn.modules.joint_detector import JointDetector
 from ljn.modules.mesh_regressor import MeshRegressor
 from ljn.runs.checkpoints import load_module
 from ljn.runs.files import write_json
-from ljn.tasks.evaluate import check_bodies, typed_overrides, with_checkpoint_config
-from ljn.tasks.train import prepare_process
+from ljn.tasks.overrides import check_bodies, typed_overrides, with_checkpoint_config
+from ljn.tasks.running import prepare_process
 from ljn.tasks.validation import check_writable, validate
 
 _LOG = logging.getLogger(__name__)

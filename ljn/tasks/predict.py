@@ -3,47 +3,32 @@
 import logging
 import sys
 from dataclasses import asdict
-from itertools import pairwise
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
 from ljn.body.skeleton import JOINT_NAMES
 from ljn.geometry.camera import Camera
 from ljn.geometry.distance import distances_to_mesh
-from ljn.pipeline.inputs import DEPTH_SUFFIXES, read_camera, read_depth, read_keypoints, read_mask
+from ljn.pipeline.frames import FrameFiles, find_frames, predict_frames
+from ljn.pipeline.inputs import read_camera
 from ljn.pipeline.pictures import draw_prediction
-from ljn.pipeline.pipeline import ObservedFrame, Pipeline, Prediction
+from ljn.pipeline.pipeline import Pipeline, Prediction
 from ljn.pipeline.writing import import_trimesh, write_arrays, write_mesh
 from ljn.runs.files import write_json
 from ljn.tasks.validation import check_writable
 
 _LOG = logging.getLogger(__name__)
-_BATCH = 8
+_NEEDED = ("task.input", "task.camera", "task.keypoints", "ckpt_path")
+_OPTIONAL = ("task.mask", "task.mesh_ckpt_path")
 _COMMAND = (
-    "python run.py task=predict input=DEPTH.png camera=CAMERA.yaml keypoints=KEYPOINTS.json ckpt_path=DETECTOR.ckpt "
-    "mesh_ckpt_path=MESH.ckpt"
+    "python run.py task=predict task.input=DEPTH.png task.camera=CAMERA.yaml task.keypoints=KEYPOINTS.json "
+    "ckpt_path=DETECTOR.ckpt task.mesh_ckpt_path=MESH.ckpt"
 )
-
-
-class Frame(NamedTuple):
-    """The files of one image.
-
-    Attributes:
-        name: Names its outputs.
-        depth: Depth image.
-        keypoints: Keypoints.
-        mask: Mask of the person; None for none.
-    """
-
-    name: str
-    depth: Path
-    keypoints: Path
-    mask: Path | None
 
 
 def predict(cfg: DictConfig) -> dict[str, float]:
@@ -53,8 +38,8 @@ def predict(cfg: DictConfig) -> dict[str, float]:
     what became of each frame.
 
     Args:
-        cfg: The composed configuration; of it `input`, `camera`, `keypoints`, `mask`, `ckpt_path`, `mesh_ckpt_path`,
-            `paths`, `num_threads` and `trainer.accelerator` count.
+        cfg: The composed configuration; of it `task`, `ckpt_path`, `paths`, `num_threads` and `trainer.accelerator`
+            count.
 
     Returns:
         `predict/frames`, and with a mesh regressor `predict/median_distance_mm`: the median over the frames of the
@@ -65,21 +50,24 @@ def predict(cfg: DictConfig) -> dict[str, float]:
         ValueError: The input or a checkpoint is wrong; or a frame of a folder is, after all others are written.
         ImportError: The package that writes meshes is missing.
     """
-    for key in ("input", "camera", "keypoints", "ckpt_path"):
-        if cfg[key] is None:
-            raise ValueError(f"{key}: expected a path, got null; {_COMMAND}")
-    camera = read_camera(cfg.camera)
-    frames = find_frames(cfg.input, cfg.keypoints, cfg.mask)
-    directory = Path(cfg.paths.output_dir) / "predictions" / Path(cfg.input).stem
+    task = cfg.task
+    values = {key: OmegaConf.select(cfg, key) for key in _NEEDED + _OPTIONAL}
+    for key, value in values.items():
+        if not isinstance(value, str) and (key in _NEEDED or value is not None):
+            got = "null" if value is None else f"{value!r}, no text: write '{key}=\"PATH\"'"
+            raise ValueError(f"{key}: expected a path, got {got}; {_COMMAND}")
+    camera = read_camera(task.camera)
+    frames = find_frames(task.input, task.keypoints, task.mask)
+    directory = Path(cfg.paths.output_dir) / "predictions" / Path(task.input).stem
     check_writable(directory)
-    if cfg.mesh_ckpt_path is not None:
+    if task.mesh_ckpt_path is not None:
         import_trimesh()
     if cfg.num_threads is not None:
         torch.set_num_threads(cfg.num_threads)
     use_gpu = cfg.trainer.accelerator != "cpu" and torch.cuda.is_available()
-    pipeline = Pipeline.load(cfg.ckpt_path, cfg.mesh_ckpt_path, "cuda" if use_gpu else "cpu")
+    pipeline = Pipeline.load(cfg.ckpt_path, task.mesh_ckpt_path, "cuda" if use_gpu else "cpu")
 
-    results = _predict_frames(pipeline, frames, camera, directory, may_fail=Path(cfg.input).is_dir())
+    results = _predict(pipeline, frames, camera, directory, may_fail=Path(task.input).is_dir())
     failed = [name for name, result in results.items() if "error" in result]
     distances = [
         result["median_distance_mm"] for result in results.values() if "median_distance_mm" in result
@@ -99,93 +87,44 @@ def predict(cfg: DictConfig) -> dict[str, float]:
     _LOG.info("%d of %d frames predicted: %s", len(results) - len(failed), len(results), directory)
     if failed:
         raise ValueError(
-            f"input: {len(failed)} of {len(results)} frames failed, all others are written; the first is {failed[0]}: "
-            f"{results[failed[0]]['error']} (all of them are in {directory / 'predictions.json'})"
+            f"task.input: {len(failed)} of {len(results)} frames failed, all others are written; the first is "
+            f"{failed[0]}: {results[failed[0]]['error']} (all of them are in {directory / 'predictions.json'})"
         )
     return metrics
 
 
-def find_frames(depth: str, keypoints: str, mask: str | None) -> list[Frame]:
-    """The frames of a depth image, or of a folder of them with keypoints (and masks) of the same stem in theirs.
-
-    Raises:
-        FileNotFoundError: There is no such file or folder, or no depth image in it.
-        ValueError: Files and folders are mixed, or two depth images share a stem.
-    """
-    paths = {"input": Path(depth), "keypoints": Path(keypoints)} | ({"mask": Path(mask)} if mask else {})
-    for name, path in paths.items():
-        if not path.exists():
-            raise FileNotFoundError(f"{name}: no file or folder '{path}'")
-    if len({path.is_dir() for path in paths.values()}) > 1:
-        kinds = ", ".join(
-            f"{name} is a {'folder' if path.is_dir() else 'file'}" for name, path in paths.items()
-        )
-        raise ValueError(f"input, keypoints, mask: expected files or folders alike, got: {kinds}")
-    if not paths["input"].is_dir():
-        return [Frame(paths["input"].stem, paths["input"], paths["keypoints"], paths.get("mask"))]
-    found = sorted(path for path in paths["input"].iterdir() if path.suffix.lower() in DEPTH_SUFFIXES)
-    if not found:
-        raise FileNotFoundError(f"input: no depth image ({', '.join(DEPTH_SUFFIXES)}) in '{paths['input']}'")
-    for before, path in pairwise(found):
-        if before.stem == path.stem:
-            raise ValueError(
-                f"input: '{before.name}' and '{path.name}' would write the same outputs; rename one"
-            )
-    return [
-        Frame(
-            path.stem,
-            path,
-            paths["keypoints"] / f"{path.stem}.json",
-            paths["mask"] / f"{path.stem}.png" if mask else None,
-        )
-        for path in found
-    ]
-
-
-def _predict_frames(
-    pipeline: Pipeline, frames: list[Frame], camera: Camera, directory: Path, may_fail: bool
+def _predict(
+    pipeline: Pipeline, frames: list[FrameFiles], camera: Camera, directory: Path, may_fail: bool
 ) -> dict[str, dict[str, Any]]:
     """Predict and write; returns what became of each frame."""
-    results: dict[str, dict[str, Any]] = {frame.name: {"input": str(frame.depth)} for frame in frames}
+    for frame in frames:
+        for suffix in (".npz", ".ply", ".glb", ".png"):
+            # What an earlier call left would pass for this one's.
+            (directory / f"{frame.name}{suffix}").unlink(missing_ok=True)
+    results: dict[str, dict[str, Any]] = {}
     with tqdm(total=len(frames), unit="frame", disable=None if may_fail else True) as progress:
-        for start in range(0, len(frames), _BATCH):
-            loaded = []
-            for frame in frames[start : start + _BATCH]:
-                for suffix in (".npz", ".ply", ".glb", ".png"):
-                    # What an earlier call left would pass for this one's.
-                    (directory / f"{frame.name}{suffix}").unlink(missing_ok=True)
-                try:
-                    loaded.append((frame, _load(pipeline, frame, camera)))
-                except (ValueError, FileNotFoundError) as error:
-                    if not may_fail:
-                        raise
-                    results[frame.name]["error"] = str(error)
-                    progress.write(f"{frame.name} failed: {error}", file=sys.stderr)
-                    progress.update()
-            if not loaded:
-                continue
-            batch = pipeline.predict([observed for _, observed in loaded])
-            for index, (frame, observed) in enumerate(loaded):
-                results[frame.name] |= _write(directory / frame.name, batch[index], observed.depth, camera)
-                progress.update()
+        for frame, prediction, depth, error in predict_frames(pipeline, frames, camera, FrameFiles.read):
+            results[frame.name] = {"input": str(frame.depth)}
+            if prediction is not None and depth is not None:
+                results[frame.name] |= _write(directory / frame.name, prediction, depth, camera)
+            elif error is not None:
+                if not may_fail:
+                    raise error
+                results[frame.name]["error"] = str(error)
+                progress.write(f"{frame.name} failed: {error}", file=sys.stderr)
+            progress.update()
     return results
 
 
-def _load(pipeline: Pipeline, frame: Frame, camera: Camera) -> ObservedFrame:
-    """What the networks take of a frame's files."""
-    mask = None if frame.mask is None else read_mask(frame.mask)
-    return pipeline.observe(read_depth(frame.depth), camera, read_keypoints(frame.keypoints), mask)
-
-
 def _write(path: Path, prediction: Prediction, depth: np.ndarray, camera: Camera) -> dict[str, Any]:
-    """Write a frame's files beside `path`, which has no suffix; returns what the summary says of it."""
+    """Write a frame's files beside `path`, which has no suffix; returns the summary's facts of it."""
     write_arrays(path.with_name(f"{path.name}.npz"), prediction, camera)
     draw_prediction(prediction, depth, camera).savefig(path.with_name(f"{path.name}.png"))
     is_filled = prediction.confidences == 0
-    said: dict[str, Any] = {"filled_in": [JOINT_NAMES[joint] for joint in np.flatnonzero(is_filled)]}
+    facts: dict[str, Any] = {"filled_in": [JOINT_NAMES[joint] for joint in np.flatnonzero(is_filled)]}
     if prediction.vertices is None or prediction.faces is None:
-        return said
+        return facts
     for suffix in (".ply", ".glb"):
         write_mesh(path.with_name(f"{path.name}{suffix}"), prediction.vertices, prediction.faces)
     distances = distances_to_mesh(prediction.points[:, :3], prediction.vertices, prediction.faces)
-    return said | {"median_distance_mm": 1000 * float(np.median(distances))}
+    return facts | {"median_distance_mm": 1000 * float(np.median(distances))}

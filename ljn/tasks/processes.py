@@ -25,6 +25,15 @@ def is_job_of_sweep() -> bool:
     return HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN
 
 
+def sweep_name(hydra: Any) -> str:
+    """What a multirun is called: a grid of the user's own has no name but the time of its start.
+
+    Args:
+        hydra: Hydra's own part of the configuration.
+    """
+    return hydra.runtime.choices.get("sweep") or f"grid-{Path(hydra.sweep.dir).name}"
+
+
 def check_processes(plain: Mapping[str, Any]) -> None:
     """Raise a `ValueError` where a configuration, as plain values, cannot be run in the processes it asks for."""
     trainer, data = plain["trainer"], plain["data"]

@@ -19,11 +19,6 @@ class Config:
     rerun: bool = False
     tables: list[str] = field(default_factory=list)
     optimized_metric: str = "val/mpjpe"
-    input: str | None = None
-    camera: str | None = None
-    keypoints: str | None = None
-    mask: str | None = None
-    mesh_ckpt_path: str | None = None
     task: Any = None
     preset: Any = None
     data: Any = None

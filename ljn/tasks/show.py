@@ -8,7 +8,7 @@ from omegaconf import DictConfig
 from ljn.building import build
 from ljn.data import BodyDataModule
 from ljn.drawing import draw_examples
-from ljn.tasks.train import prepare_process
+from ljn.tasks.running import prepare_process
 from ljn.tasks.validation import validate
 
 _LOG = logging.getLogger(__name__)

@@ -1,36 +1,23 @@
 """`task=train`: fit a model, then test its best checkpoint."""
 
 import logging
-import math
-import os
-import warnings
 from pathlib import Path
-from typing import Any
 
-import lightning.pytorch as lightning
 import torch
-from omegaconf import DictConfig, OmegaConf, open_dict
+from omegaconf import DictConfig
 
-from ljn.building import build, build_each
+from ljn.building import build
 from ljn.data import BodyDataModule
-from ljn.modules.base import StageModule
-from ljn.runs.checkpoints import AtomicCheckpointIO, Provenance, read_checkpoint
+from ljn.runs.checkpoints import read_checkpoint
 from ljn.runs.files import read_json, write_json
 from ljn.runs.identity import config_hash, identity
 from ljn.runs.record import RunRecord, alone_in, is_complete
-from ljn.tasks.processes import check_trains_in_processes, is_first_process, num_processes, own_devices
+from ljn.tasks.processes import check_trains_in_processes, is_first_process, num_processes
+from ljn.tasks.running import build_trainer, finite_metrics, prepare_process, save_config, set_run_directory
 from ljn.tasks.tracking import tracking
 from ljn.tasks.validation import validate
 
 _LOG = logging.getLogger(__name__)
-# What Lightning says of things that are as they should be.
-_EXPECTED_WARNINGS = (
-    ".*LeafSpec.* is deprecated",  # its own use of PyTorch
-    ".*this fit will run with no optimizer",  # a yardstick
-    "Checkpoint directory .* exists and is not empty",  # a resumed run
-    "The number of training batches .* is smaller than the logging interval",
-    "It is recommended to use .*sync_dist=True",  # metrics gather themselves over processes
-)
 
 
 def train(cfg: DictConfig) -> dict[str, float]:
@@ -110,75 +97,3 @@ def _train(
         if trainer.is_global_zero:
             write_json(run_dir / "metrics.json", metrics)
     return metrics
-
-
-def set_run_directory(cfg: DictConfig, kind: str, identity_hash: str) -> Path:
-    """Name the directory `output_dir/kind/NAME-PRESET-HASH` and make it `paths.run_dir`."""
-    name = f"{cfg.name.replace('/', '-')}-{cfg.preset.name}-{identity_hash}"
-    run_dir = Path(cfg.paths.output_dir) / kind / name
-    with open_dict(cfg):
-        cfg.paths.run_dir = str(run_dir)
-    return run_dir
-
-
-def prepare_process(cfg: DictConfig) -> None:
-    """Seed the global generators, share the cores between PyTorch and the data workers, quieten Lightning."""
-    for name in ("lightning.pytorch", "lightning.fabric"):
-        logging.getLogger(name).setLevel(logging.WARNING)
-    for message in _EXPECTED_WARNINGS:
-        warnings.filterwarnings("ignore", message)
-    lightning.seed_everything(cfg.seed, workers=True, verbose=False)
-    # With a thread on every core, each parallel region waits for the one that shares its core with a worker.
-    number = num_processes(cfg.trainer)
-    num_threads = cfg.num_threads or max(1, _num_cores() // (2 * number))
-    torch.set_num_threads(num_threads)
-    if number > 1:
-        # Where this is not set, Lightning gives each of several processes its share of all cores.
-        os.environ.setdefault("OMP_NUM_THREADS", str(num_threads))
-
-
-def _num_cores() -> int:
-    """Cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def build_trainer(
-    cfg: DictConfig, run_dir: Path, config: dict[str, Any], datamodule: BodyDataModule, module: StageModule
-) -> lightning.Trainer:
-    """The trainer with its callbacks and loggers, writing below the run's directory."""
-    body_hashes = {*datamodule.body_hash.split("-"), *module.body_hashes}
-    provenance = Provenance(
-        config, "-".join(sorted(body_hashes)), datamodule.licence, run_dir.name, datamodule.recipe
-    )
-    return build(
-        cfg.trainer,
-        default_root_dir=str(run_dir),
-        callbacks=[*build_each(cfg.callbacks), provenance],
-        logger=build_each(cfg.logger),
-        plugins=[AtomicCheckpointIO()],
-        use_distributed_sampler=False,  # the data module gives each process its part, and none twice
-        **own_devices(cfg.trainer),
-    )
-
-
-def finite_metrics(trainer: lightning.Trainer) -> dict[str, float]:
-    """The metrics of the trainer's last validation or test.
-
-    Raises:
-        FloatingPointError: One of them is not finite.
-    """
-    metrics = {name: float(value) for name, value in trainer.callback_metrics.items()}
-    bad = [name for name, value in metrics.items() if not math.isfinite(value)]
-    if bad:
-        raise FloatingPointError(
-            f"{', '.join(bad)} not finite: the model predicts NaN or infinity; lower the learning rate"
-        )
-    return metrics
-
-
-def save_config(cfg: DictConfig, run_dir: Path) -> dict[str, Any]:
-    """Write `config.yaml`, resolved, in the first process; returns the same as plain values."""
-    config: dict[str, Any] = OmegaConf.to_container(cfg, resolve=True)  # type: ignore[assignment]
-    if is_first_process():
-        (run_dir / "config.yaml").write_text(OmegaConf.to_yaml(OmegaConf.create(config)))
-    return config

@@ -22,11 +22,6 @@ def validate(cfg: DictConfig) -> None:
         plain: dict[str, Any] = OmegaConf.to_container(cfg, resolve=True, throw_on_missing=True)  # type: ignore[assignment]
     except OmegaConfBaseException as error:
         raise ValueError(f"config: {error}".split("\n")[0]) from error
-    unread = [name for name in ("input", "camera", "keypoints", "mask", "mesh_ckpt_path") if plain.get(name)]
-    if unread:
-        raise ValueError(
-            f"{', '.join(unread)}: only task=predict reads this; add task=predict, or leave it out"
-        )
     check_targets({name: value for name, value in plain.items() if name != "task"})
     _check_radii(plain.get("model") or {})
     _check_integers(plain)

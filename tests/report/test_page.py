@@ -202,9 +202,9 @@ def test_a_damaged_picture_is_left_out_with_a_warning(sweep):
 def test_curves_over_the_axis_have_error_bars_and_the_thesis_dashed(sweep):
     for seed in (0, 1):
         folder = sweep.run("detector/sigma_5px", {"mpjpe_eq38": 60.0 + seed, "pckh": 50.0}, seed)
-        (folder / "config.yaml").write_text("data:\n  keypoint_noise_px: 5\n")
+        (folder / "config.yaml").write_text("data:\n  synthesis:\n    keypoint_noise_px: 5\n")
     folder = sweep.run("detector/proposed", {"mpjpe_eq38": 70.0, "pckh": 40.0})
-    (folder / "config.yaml").write_text("data:\n  keypoint_noise_px: 10\n")
+    (folder / "config.yaml").write_text("data:\n  synthesis:\n    keypoint_noise_px: 10\n")
     write_report(sweep.write("table_3_3"))
     html = (sweep.directory / "report.html").read_text()
     assert "<title>ours, 5: 60.5 ± 0.7</title>" in html

@@ -8,7 +8,6 @@ import time
 import pytest
 
 from ljn.runs.files import read_json, write_json
-from ljn.runs.identity import config_hash, identity
 from ljn.runs.record import RunRecord, alone_in, is_complete
 
 
@@ -80,41 +79,6 @@ def test_a_run_is_complete_only_with_its_own_hash_and_metrics(tmp_path):
     write_json(tmp_path / "metrics.json", {})
     assert is_complete(tmp_path, "abc")
     assert not is_complete(tmp_path, "def")
-
-
-def test_the_identity_ignores_paths_loggers_and_workers(compose_config):
-    def hash_of(*overrides):
-        return config_hash(identity(compose_config("experiment=detector/proposed", *overrides), "data"))
-
-    same = hash_of()
-    for override in (
-        "paths.output_dir=elsewhere",
-        "logger=csv",
-        "data.num_workers=7",
-        "trainer.accelerator=cpu",
-        "trainer.devices=2",  # what a batch is does not change with it
-        "trainer.strategy=ddp",
-        "callbacks.pictures=null",
-        "group=sweep",
-        "num_threads=3",
-        "preset.name=other",
-        "data.synthesis.keypoint_noise_px=10.0",
-        "data.source.path=the_same_content_elsewhere.npz",
-    ):
-        assert hash_of(override) == same, override
-    for override in (
-        "seed=1",
-        "data.synthesis.keypoint_noise_px=5",
-        "preset.num_points=512",
-        "model.edm=false",
-        "module.optimizer.lr=0.1",
-        "trainer.max_epochs=1",
-        "optimized_metric=val/pckh",
-        "callbacks.best.mode=max",
-        "+callbacks.stop={_target_:lightning.pytorch.callbacks.EarlyStopping,monitor:val/mpjpe}",
-    ):
-        assert hash_of(override) != same, override
-    assert config_hash(identity(compose_config("experiment=detector/proposed"), "other")) != same
 
 
 def test_a_second_run_in_a_directory_waits_for_the_first(tmp_path):

@@ -3,11 +3,12 @@ from pathlib import Path
 
 import pytest
 from hydra.errors import ConfigCompositionException
-from omegaconf import OmegaConf, open_dict
+from omegaconf import open_dict
 
 from datamodules.synthesis import SynthesisSettings
 from ljn.building import build, build_each, check_targets
 from ljn.cloud.observation import ObservationRecipe
+from ljn.report.tables import TABLES
 from ljn.tasks.validation import check_writable, validate
 
 CONF = Path(__file__).parents[2] / "conf"
@@ -74,10 +75,32 @@ def test_every_experiment_opens_with_the_command_that_runs_it():
         assert re.search(rf"^name: {name}$", text, re.MULTILINE), name
 
 
-def test_presets_have_the_same_keys():
-    presets = {path.stem: OmegaConf.load(path) for path in (CONF / "preset").glob("*.yaml")}
-    keys = {name: sorted(preset) for name, preset in presets.items()}
-    assert len({tuple(value) for value in keys.values()}) == 1, keys
+@pytest.mark.parametrize("preset", sorted(path.stem for path in (CONF / "preset").glob("*.yaml")))
+def test_every_network_composes_with_every_preset(preset, compose_config, tmp_path):
+    for experiment in ("detector/proposed", "detector/basic", "detector/simple_baseline"):
+        validate(
+            compose_config(f"preset={preset}", f"experiment={experiment}", f"paths.output_dir={tmp_path}")
+        )
+    for experiment in ("mesh/proposed", "mesh/basic", "mesh/pointnet", "mesh/half_points"):
+        cfg = compose_config(f"preset={preset}", f"experiment={experiment}", f"paths.output_dir={tmp_path}")
+        validate(cfg)
+        assert cfg.module.optimizer.lr == cfg.preset.learning_rate
+
+
+def test_the_thesis_figures_in_comments_are_those_of_the_tables():
+    columns = {"APVE": "apve", "MPJPE": "mpjpe_eq38", "PCKh": "pckh"}
+    commented = set()
+    for name in (choice.removeprefix("experiment=") for choice in EXPERIMENTS):
+        text = (CONF / "experiment" / f"{name}.yaml").read_text()
+        figures = re.findall(r"([\d.]+) (?:mm|%) (APVE|MPJPE|PCKh)", text)
+        if not figures:
+            continue
+        [table] = re.findall(r"Table 3\.(\d)", text)
+        [row] = [row for row in TABLES[f"table_3_{table}"].rows if row.experiment == name]
+        expected = {key: row.thesis[key] for key in columns.values() if key in row.thesis}
+        assert {columns[label]: float(value) for value, label in figures} == expected, name
+        commented.add(name)
+    assert commented == {row.experiment for table in TABLES.values() for row in table.rows if row.thesis}
 
 
 def test_the_cosine_of_the_small_preset_ends_with_the_training(compose_config):
@@ -96,6 +119,12 @@ def test_the_thesis_preset_holds_the_specs_numbers(compose_config):
     assert cfg.module.optimizer._target_ == "torch.optim.RAdam"
     assert (cfg.module.scheduler.step_size, cfg.module.scheduler.gamma) == (5, 0.1)
     assert cfg.data.observation.normals == "knn"
+    mesh = compose_config("preset=thesis", "experiment=mesh/proposed").model
+    assert (mesh.trunk.num_centres, mesh.trunk.group_sizes) == ([512, 128], [32, 64])
+    assert (mesh.trunk.channels, mesh.trunk.global_channels) == (
+        [[64, 64, 128], [128, 128, 256]],
+        [256, 512, 1024],
+    )
 
 
 def test_a_misspelt_key_is_rejected(compose_config):
@@ -151,7 +180,6 @@ def test_a_value_of_the_wrong_type_is_rejected(compose_config):
         ),
         (["num_threads=-2"], r"num_threads: expected 1 or more, or null, got -2"),
         (["paths.cache_dir=/dev/null/x"], r"paths\.cache_dir: cannot write in '/dev/null/x'"),
-        (["input=depth.png"], r"input: only task=predict reads this; add task=predict"),
         (["callbacks.best.monitor=val/mjpe"], r"callbacks\.best\.monitor: no metric 'val/mjpe'.*val/mpjpe"),
         (["optimized_metric=val/pckh"], r"callbacks\.best\.mode: 'min' would keep the worst.*mode=max"),
         (

@@ -6,7 +6,8 @@ import torch
 import yaml
 
 from ljn.runs.checkpoints import read_checkpoint
-from ljn.tasks.evaluate import evaluate, with_checkpoint_config
+from ljn.tasks.evaluate import evaluate
+from ljn.tasks.overrides import with_checkpoint_config
 
 
 def evaluation(smoke_config, trained, tmp_path, *overrides, ckpt_path=None):
@@ -155,6 +156,19 @@ def test_overrides_change_data_and_nothing_that_the_checkpoint_decides(trained, 
         with_checkpoint_config(cfg, checkpoint, ["data.source=null"])
     with pytest.raises(ValueError, match=r"no key 'data\.num_tset'; known there: .*num_test"):
         with_checkpoint_config(cfg, checkpoint, ["data.num_tset=3"])
+
+
+def test_an_evaluation_has_this_machines_values_and_the_checkpoints_keys(
+    write_checkpoint, smoke_config, tmp_path
+):
+    checkpoint = read_checkpoint(write_checkpoint("detector/basic", "trainer.accelerator=cpu"))
+    del checkpoint.config["data"]["prefetch_batches"]  # a data module without it
+    here = ("data.num_workers=3", "trainer.accelerator=gpu", "trainer.max_epochs=7", "name=other")
+    merged = with_checkpoint_config(smoke_config(tmp_path, *here), checkpoint, [])
+    assert (merged.data.num_workers, merged.trainer.accelerator) == (3, "gpu")
+    assert merged.data.cache_dir == f"{tmp_path}/cache"
+    assert (merged.trainer.max_epochs, merged.name) == (2, "detector/basic")
+    assert "prefetch_batches" not in merged.data
 
 
 def test_other_bodies_reach_all_that_was_made_of_the_bodies_group(write_checkpoint, smoke_config, tmp_path):

@@ -52,12 +52,12 @@ def config(smoke_config, files, checkpoints, tmp_path):
 
     def make(*changes):
         paths = {
-            "input": files / "depth.png",
-            "camera": files / "camera.json",
-            "keypoints": files / "keypoints.json",
-            "mask": files / "mask.png",
+            "task.input": files / "depth.png",
+            "task.camera": files / "camera.json",
+            "task.keypoints": files / "keypoints.json",
+            "task.mask": files / "mask.png",
             "ckpt_path": checkpoints[0],
-            "mesh_ckpt_path": checkpoints[1],
+            "task.mesh_ckpt_path": checkpoints[1],
         }
         given = [f"{key}={path}" for key, path in paths.items()]
         return smoke_config(tmp_path, "task=predict", *given, *changes)
@@ -77,7 +77,7 @@ def folders(files, tmp_path):
     outputs.mkdir(parents=True)
     (outputs / "b.npz").write_bytes(b"of an earlier call")
     changes = [
-        f"{key}={tmp_path / name}"
+        f"task.{key}={tmp_path / name}"
         for key, name in (("input", "depth"), ("keypoints", "keypoints"), ("mask", "mask"))
     ]
     return changes, outputs
@@ -85,9 +85,10 @@ def folders(files, tmp_path):
 
 def test_the_command_predicts_an_image(config, files, checkpoints, run_py, tmp_path):
     done = run_py(
-        *("task=predict", f"input={files / 'depth.png'}", f"camera={files / 'camera.json'}"),
-        *(f"keypoints={files / 'keypoints.json'}", f"mask={files / 'mask.png'}"),
-        *(f"ckpt_path={checkpoints[0]}", f"mesh_ckpt_path={checkpoints[1]}", f"paths.output_dir={tmp_path}"),
+        *("task=predict", f"task.input={files / 'depth.png'}", f"task.camera={files / 'camera.json'}"),
+        *(f"task.keypoints={files / 'keypoints.json'}", f"task.mask={files / 'mask.png'}"),
+        *(f"ckpt_path={checkpoints[0]}", f"task.mesh_ckpt_path={checkpoints[1]}"),
+        f"paths.output_dir={tmp_path}",
     )
     outputs = tmp_path / "predictions" / "depth"
     assert {path.name for path in outputs.iterdir()} == {
@@ -103,7 +104,7 @@ def test_the_command_predicts_an_image(config, files, checkpoints, run_py, tmp_p
 
 
 def test_without_a_mesh_checkpoint_joints_alone_are_written(config, tmp_path):
-    assert predict(config("mesh_ckpt_path=null")) == {"predict/frames": 1}
+    assert predict(config("task.mesh_ckpt_path=null")) == {"predict/frames": 1}
     outputs = tmp_path / "predictions" / "depth"
     assert {path.name for path in outputs.iterdir()} == {"depth.npz", "depth.png", "predictions.json"}
 
@@ -127,19 +128,29 @@ def test_keypoints_that_are_missing_for_a_frame_fail_that_frame(folders, config,
     changes, outputs = folders
     (tmp_path / "keypoints" / "c.json").unlink()
     with pytest.raises(ValueError, match="2 of 3 frames failed"):
-        predict(config(*changes, "mesh_ckpt_path=null"))
+        predict(config(*changes, "task.mesh_ckpt_path=null"))
     assert {path.stem for path in outputs.glob("*.npz")} == {"a"}
 
 
-@pytest.mark.parametrize("key", ["input", "camera", "keypoints", "ckpt_path"])
+NEEDED = ["task.input", "task.camera", "task.keypoints", "ckpt_path"]
+
+
+@pytest.mark.parametrize("key", NEEDED)
 def test_what_a_prediction_needs_is_named(key, config):
     with pytest.raises(
-        ValueError, match=f"{key}: expected a path, got null; python run.py task=predict input="
+        ValueError, match=rf"{key}: expected a path, got null; python run\.py task=predict task\.input="
     ):
         predict(config(f"{key}=null"))
 
 
-@pytest.mark.parametrize("key", ["input", "camera", "keypoints", "mask", "ckpt_path", "mesh_ckpt_path"])
+def test_a_number_is_no_path(config):
+    with pytest.raises(
+        ValueError, match=r"task\.input: expected a path, got 20230401, .*'task\.input=\"PATH\"'"
+    ):
+        predict(config("task.input=2023_04_01"))
+
+
+@pytest.mark.parametrize("key", [*NEEDED, "task.mask", "task.mesh_ckpt_path"])
 def test_a_missing_file_is_an_error(key, config):
     with pytest.raises(FileNotFoundError, match=r"no file .*'nowhere\.x'"):
         predict(config(f"{key}=nowhere.x"))
@@ -155,14 +166,14 @@ def test_nothing_is_loaded_before_the_cheap_checks(config, folders, monkeypatch,
         predict(config(*changes[:2]))
     (tmp_path / "empty").mkdir()
     with pytest.raises(FileNotFoundError, match=r"no depth image \(\.png, \.npy, \.npz\) in"):
-        predict(config(*changes[1:], f"input={tmp_path / 'empty'}"))
+        predict(config(*changes[1:], f"task.input={tmp_path / 'empty'}"))
     (tmp_path / "depth" / "a.npy").touch()
     with pytest.raises(ValueError, match=r"'a.npy' and 'a.png' would write the same outputs"):
         predict(config(*changes))
 
 
 def test_the_model_and_data_of_the_configuration_do_not_matter(config):
-    broken = config("mesh_ckpt_path=null", "model.radii_m=[1]", "data.observation.num_points=0")
+    broken = config("task.mesh_ckpt_path=null", "model.radii_m=[1]", "data.observation.num_points=0")
     assert predict(broken) == {"predict/frames": 1}
 
 

@@ -13,6 +13,7 @@ import torch
 from lightning.pytorch import Callback
 from omegaconf import OmegaConf
 
+from ljn.tasks import running
 from ljn.tasks import train as train_task
 from ljn.tasks.train import train
 
@@ -110,10 +111,10 @@ def test_a_resumed_run_equals_an_uninterrupted_one(smoke_config, tmp_path, monke
     whole = smoke_config(tmp_path / "whole", *overrides)
     metrics = train(whole)
 
-    original = train_task.build_each
+    original = running.build_each
     with monkeypatch.context() as patch:
         patch.setattr(
-            train_task,
+            running,
             "build_each",
             lambda node: [*original(node), *([Stop(epoch)] if "best" in node else [])],
         )

@@ -1,0 +1,152 @@
+"""Frames one after another, from files or a camera, of which one may fail without harm to the others."""
+
+from collections.abc import Callable, Iterable, Iterator
+from itertools import islice, pairwise
+from pathlib import Path
+from typing import Any, Generic, NamedTuple, TypeVar
+
+import numpy as np
+
+from ljn.geometry.camera import Camera
+from ljn.pipeline.inputs import DEPTH_SUFFIXES, read_depth, read_keypoints, read_mask
+from ljn.pipeline.pipeline import Pipeline, Prediction
+
+FrameT = TypeVar("FrameT")
+
+
+class FrameImages(NamedTuple):
+    """What is known of one image; each part as `Pipeline` takes it.
+
+    Attributes:
+        depth: `(H, W)`.
+        keypoints: 2D keypoints.
+        mask: `(H, W)`; None for none.
+    """
+
+    depth: Any
+    keypoints: Any
+    mask: Any = None
+
+
+class FrameFiles(NamedTuple):
+    """The files of one image.
+
+    Attributes:
+        name: Names its outputs.
+        depth: Depth image.
+        keypoints: Keypoints.
+        mask: Mask of the person; None for none.
+    """
+
+    name: str
+    depth: Path
+    keypoints: Path
+    mask: Path | None
+
+    def read(self) -> FrameImages:
+        """What the files hold.
+
+        Raises:
+            FileNotFoundError: One is missing.
+            ValueError: One cannot be read.
+        """
+        mask = None if self.mask is None else read_mask(self.mask)
+        return FrameImages(read_depth(self.depth), read_keypoints(self.keypoints), mask)
+
+
+class FrameResult(NamedTuple, Generic[FrameT]):
+    """What became of a frame: a prediction, or an error.
+
+    Attributes:
+        frame: The frame.
+        prediction: See `Pipeline`; None after an error.
+        depth: `(H, W)`, the body's, metres; None after an error.
+        error: What was wrong with it; None otherwise.
+    """
+
+    frame: FrameT
+    prediction: Prediction | None = None
+    depth: np.ndarray | None = None
+    error: Exception | None = None
+
+
+def predict_frames(
+    pipeline: Pipeline,
+    frames: Iterable[FrameT],
+    camera: Camera,
+    read: Callable[[FrameT], FrameImages],
+    batch_size: int = 8,
+) -> Iterator[FrameResult[FrameT]]:
+    """Predict frames, a batch at a time.
+
+    Args:
+        pipeline: The pipeline.
+        frames: The frames, in any form; taken as they are needed.
+        camera: The camera of all of them.
+        read: What is known of a frame. `FileNotFoundError` and `ValueError`, and the pipeline's about a frame's
+            images, become the frame's result.
+        batch_size: Frames taken before the networks run; 1 for a camera, whose next frame comes later.
+
+    Yields:
+        A result for each frame, in their order.
+    """
+    remaining = iter(frames)
+    while batch := list(islice(remaining, batch_size)):
+        results, observations = [], []
+        for frame in batch:
+            try:
+                images = read(frame)
+                observed = pipeline.observe(images.depth, camera, images.keypoints, images.mask)
+                observations.append(observed)
+                results.append(FrameResult(frame, depth=observed.depth))
+            except (ValueError, FileNotFoundError) as error:
+                results.append(FrameResult(frame, error=error))
+        predictions = pipeline.predict(observations) if observations else None
+        number = 0
+        for result in results:
+            if predictions is not None and result.error is None:
+                result = result._replace(prediction=predictions[number])
+                number += 1
+            yield result
+
+
+def find_frames(input: str | Path, keypoints: str | Path, mask: str | Path | None) -> list[FrameFiles]:
+    """The frames of a depth image, or of a folder of them with keypoints (and masks) of the same stem in theirs.
+
+    Args:
+        input: The depth image, or the folder.
+        keypoints: Its keypoints, or their folder.
+        mask: Its mask, or their folder; None for none.
+
+    Raises:
+        FileNotFoundError: There is no such file or folder, or no depth image in it.
+        ValueError: Files and folders are mixed, or two depth images share a stem.
+    """
+    paths = {"input": Path(input), "keypoints": Path(keypoints)} | ({"mask": Path(mask)} if mask else {})
+    for name, path in paths.items():
+        if not path.exists():
+            raise FileNotFoundError(f"{name}: no file or folder '{path}'")
+    if len({path.is_dir() for path in paths.values()}) > 1:
+        kinds = ", ".join(
+            f"{name} is a {'folder' if path.is_dir() else 'file'}" for name, path in paths.items()
+        )
+        raise ValueError(f"input, keypoints, mask: expected files or folders alike, got: {kinds}")
+    if not paths["input"].is_dir():
+        return [FrameFiles(paths["input"].stem, paths["input"], paths["keypoints"], paths.get("mask"))]
+    images = sorted(path for path in paths["input"].iterdir() if path.suffix.lower() in DEPTH_SUFFIXES)
+    if not images:
+        raise FileNotFoundError(f"input: no depth image ({', '.join(DEPTH_SUFFIXES)}) in '{paths['input']}'")
+    for before, path in pairwise(images):
+        if before.stem == path.stem:
+            raise ValueError(
+                f"input: '{before.name}' and '{path.name}' would write the same outputs; rename one"
+            )
+    return [
+        FrameFiles(
+            path.stem,
+            path,
+            paths["keypoints"] / f"{path.stem}.json",
+            paths["mask"] / f"{path.stem}.png" if mask else None,
+        )
+        for path in images
+    ]

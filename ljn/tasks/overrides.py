@@ -1,0 +1,107 @@
+"""A call's overrides, and what an evaluation makes of them and of its checkpoint's configuration."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from hydra.core.hydra_config import HydraConfig
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from omegaconf import DictConfig, OmegaConf
+
+from ljn.building import check_targets
+from ljn.runs.checkpoints import Checkpoint
+from ljn.runs.keys import CONFIG_GROUPS, Key, key_of, kind_of
+
+# A stored configuration is resolved: what was made of the body's group has to follow by hand.
+_OF_BODY = {
+    "body.path": ("data.body_path", "module.body_path"),
+    "body.genders": ("data.source.genders", "module.genders"),
+    "body.predicted": ("module.predicted",),
+}
+_MISSING = object()
+
+
+def typed_overrides() -> list[str]:
+    """What was typed after `run.py`; nothing in a process that Hydra did not start."""
+    return list(HydraConfig.get().overrides.task) if HydraConfig.initialized() else []
+
+
+def with_checkpoint_config(cfg: DictConfig, checkpoint: Checkpoint, overrides: list[str]) -> DictConfig:
+    """The call's configuration with the checkpoint's model, data and trainer, and the overrides on top.
+
+    Of the checkpoint's groups, the keys that `ljn.runs.keys` gives to the machine or the call have this call's values.
+
+    Args:
+        cfg: The call's composed configuration.
+        checkpoint: The checkpoint.
+        overrides: The call's overrides, as they were typed.
+
+    Raises:
+        ValueError: An override is about something that the checkpoint decides.
+    """
+    check_targets({name: checkpoint.config.get(name) for name in CONFIG_GROUPS}, "the checkpoint's config")
+    plain: dict[str, Any] = OmegaConf.to_container(cfg, resolve=False)  # type: ignore[assignment]
+    plain |= {name: _with_call(checkpoint.config[name], plain[name], name) for name in CONFIG_GROUPS}
+    merged = OmegaConf.create(plain)
+    OmegaConf.set_struct(merged, True)
+    apply_overrides(merged, overrides)
+    return merged
+
+
+def _with_call(stored: Any, call: Any, key: str) -> Any:
+    """A checkpoint's values, with those of this call in its keys that are from a call."""
+    if not (isinstance(stored, Mapping) and isinstance(call, Mapping)):
+        return call if kind_of(key).is_from_call else stored
+    return {
+        name: _with_call(value, call[name], f"{key}.{name}") if name in call else value
+        for name, value in stored.items()
+    }
+
+
+def apply_overrides(cfg: DictConfig, overrides: list[str]) -> None:
+    """Change single values of data, trainer and body in a resolved configuration.
+
+    Args:
+        cfg: What a checkpoint's configuration is part of.
+        overrides: As they would be typed; those about what the checkpoint has no say in are left out.
+
+    Raises:
+        ValueError: An override is about something that the checkpoint decides, or names no value.
+    """
+    for override in OverridesParser.create().parse_overrides(overrides):
+        line = override.input_line or ""
+        key = key_of(line)
+        kind = kind_of(key)
+        is_value = "/" not in override.key_or_group and not (override.is_delete() or override.is_add())
+        if Key.CHANGEABLE in kind and "." in key and is_value:
+            _set(cfg, key, override.value(), line)
+        elif not kind.is_from_call:
+            raise ValueError(
+                f"{line}: model, data and sizes come from the checkpoint; an evaluation can change single values of "
+                "data, trainer and body (data.synthesis.keypoint_noise_px=15) and choose callbacks, logger and paths"
+            )
+
+
+def _set(cfg: DictConfig, key: str, value: Any, line: str) -> None:
+    current = OmegaConf.select(cfg, key, default=_MISSING)
+    if isinstance(current, DictConfig):
+        raise ValueError(
+            f"{line}: '{key}' holds several values; change one of them: {', '.join(map(str, current))}"
+        )
+    if current is _MISSING:
+        parent = OmegaConf.select(cfg, key.rpartition(".")[0])
+        known = ", ".join(sorted(str(name) for name in parent)) if isinstance(parent, DictConfig) else "none"
+        raise ValueError(f"{line}: the checkpoint's config has no key '{key}'; known there: {known}")
+    OmegaConf.update(cfg, key, value)
+    for derived in _OF_BODY.get(key, ()):
+        if OmegaConf.select(cfg, derived, default=_MISSING) is not _MISSING:
+            OmegaConf.update(cfg, derived, value)
+
+
+def check_bodies(checkpoint: Checkpoint, hashes: set[str]) -> None:
+    """Raise a `ValueError` unless a checkpoint was trained with the bodies of these hashes."""
+    if unknown := checkpoint.unknown_bodies(hashes):
+        raise ValueError(
+            f"body: the checkpoint was trained with the bodies {checkpoint.body_hash}; {unknown[0]} is not among "
+            "them. A model is only meaningful with its bodies: name them with body.path=FILE_OR_FOLDER and "
+            "body.genders"
+        )

@@ -1,0 +1,155 @@
+import shutil
+from collections.abc import Mapping
+from dataclasses import fields
+from pathlib import Path
+
+import pytest
+from omegaconf import OmegaConf, open_dict
+
+from ljn.runs.identity import config_hash, identity
+from ljn.runs.keys import CONFIG_GROUPS, KEYS, Key, is_listed, kind_of
+from ljn.runs.sweep import settings
+from ljn.tasks.schema import Config
+
+CONF = Path(__file__).parents[2] / "conf"
+
+
+def leaves(value, key=""):
+    """The dotted keys of all values in nested mappings, and the values."""
+    if isinstance(value, Mapping) and value:
+        for name, entry in value.items():
+            yield from leaves(entry, f"{key}.{name}".lstrip("."))
+    else:
+        yield key, value
+
+
+def keys_of(conf):
+    """All that can be set: the schema's keys, each folder as a group, each file's keys in their package."""
+    keys = {field.name for field in fields(Config)}
+    for path in conf.rglob("*.yaml"):
+        group = ".".join(path.parent.relative_to(conf).parts)
+        content = OmegaConf.to_container(OmegaConf.load(path), resolve=False)
+        content.pop("defaults", None)
+        package = "" if "@package _global_" in path.read_text() else group
+        keys |= {group, *(key for key, _ in leaves(content, package))}
+    return keys - {""}
+
+
+def test_every_key_has_a_row_and_every_row_a_key():
+    keys = keys_of(CONF)
+    assert [key for key in sorted(keys) if not is_listed(key)] == []
+    # conf/local is the user's own; a chosen group is no value.
+    unused = {row for row in KEYS if not any(key == row or key.startswith(f"{row}.") for key in keys)}
+    assert unused == {"local"}
+
+
+@pytest.mark.parametrize(
+    ("file", "line", "key"),
+    [
+        ("config.yaml", "new: null", "new"),
+        ("data/synthetic.yaml", "new: null", "data.new"),
+        ("trainer/default.yaml", "new: null", "trainer.new"),
+        ("module/mesh_regressor.yaml", "new: {nested: null}", "module.new.nested"),
+        ("callbacks/default.yaml", "new: null", "callbacks.new"),
+        ("experiment/mesh/chain.yaml", "data: {new: 1}", "data.new"),
+        ("data/sensor/kinect.yaml", "new: null", "data.sensor.new"),
+        ("data/sensor/kinect.yaml", "", "data.sensor"),
+        ("sensor/kinect.yaml", "new: null", "sensor.new"),
+    ],
+)
+def test_a_new_key_without_a_row_is_noticed(file, line, key, tmp_path):
+    conf = shutil.copytree(CONF, tmp_path / "conf")
+    (conf / file).parent.mkdir(parents=True, exist_ok=True)
+    with (conf / file).open("a") as stream:
+        stream.write(f"\n{line}\n")
+    assert key in {key for key in keys_of(conf) if not is_listed(key)}
+
+
+def test_what_a_checkpoint_holds():
+    assert sorted(CONFIG_GROUPS) == sorted(
+        ("preset", "model", "module", "data", "body", "trainer", "seed", "name", "optimized_metric")
+    )
+
+
+def hash_of(cfg, data="data"):
+    return config_hash(identity(cfg, data))
+
+
+@pytest.mark.parametrize("experiment", ["detector/proposed", "mesh/proposed", "detector/ridge"])
+def test_the_values_of_the_runs_keys_alone_are_its_identity(experiment, compose_config, monkeypatch):
+    monkeypatch.setattr("ljn.runs.identity.predicted_body", lambda cfg: "body")
+    plain = OmegaConf.to_container(
+        compose_config(f"experiment={experiment}", "paths.run_dir=run"), resolve=True
+    )
+    same = hash_of(OmegaConf.create(plain))
+    for key, _ in leaves(plain):
+        changed = OmegaConf.create(plain)
+        OmegaConf.update(changed, key, "changed")
+        assert (hash_of(changed) != same) == (Key.RUN in kind_of(key)), key
+
+
+def test_what_differs_in_the_machine_or_the_call_alone_is_one_run(compose_config):
+    same = hash_of(compose_config("experiment=detector/proposed"))
+    for override in (
+        *("paths.output_dir=elsewhere", "logger=csv", "group=sweep", "num_threads=3", "preset.name=other"),
+        *(
+            "data.num_workers=7",
+            "data.prefetch_batches=2",
+            "callbacks.pictures=null",
+            "trainer.accelerator=cpu",
+        ),
+        *("trainer.devices=2", "trainer.strategy=ddp"),  # what a batch is does not change with them
+        *("data.synthesis.keypoint_noise_px=10.0", "data.source.path=the_same_content_elsewhere.npz"),
+    ):
+        assert hash_of(compose_config("experiment=detector/proposed", override)) == same, override
+    for override in (
+        *(
+            "seed=1",
+            "data.synthesis.keypoint_noise_px=5",
+            "data.camera.fx=300",
+            "preset.num_points=512",
+            "model.edm=false",
+        ),
+        *("module.optimizer.lr=0.1", "trainer.max_epochs=1", "+trainer.accumulate_grad_batches=2"),
+        *("optimized_metric=val/pckh", "callbacks.best.mode=max"),
+        "+callbacks.stop={_target_:lightning.pytorch.callbacks.EarlyStopping,monitor:val/mpjpe}",
+    ):
+        assert hash_of(compose_config("experiment=detector/proposed", override)) != same, override
+    assert hash_of(compose_config("experiment=detector/proposed"), "other") != same
+
+
+def test_a_new_knob_that_is_null_changes_no_identity(compose_config):
+    cfg = compose_config("experiment=detector/proposed")
+    with open_dict(cfg):
+        cfg.data.steps = [{"sigma": 1}, None]
+        same = hash_of(cfg)
+        cfg.data.new = cfg.data.camera.new = cfg.module.optimizer.new = cfg.data.steps[0].new = None
+        cfg.data.sensor = {"noise": None, "holes": {"share": None}}
+        assert hash_of(cfg) == same
+        cfg.data.steps = [{"sigma": 1}]  # the places of a list count
+        assert hash_of(cfg) != same
+
+
+def test_settings_are_what_tells_rows_apart():
+    typed = (
+        *(
+            "experiment=detector/basic",
+            "seed=3",
+            "sweep=demo",
+            "preset=small",
+            "data.num_workers=2",
+            "name=x",
+        ),
+        *("hydra/launcher=local", "logger=csv", "callbacks.pictures=null", "trainer.devices=2", "rerun=true"),
+    )
+    kept = (
+        *(
+            "+trainer.new=1",
+            "ckpt_path=a.ckpt",
+            "data.observation.num_points=512",
+            "data/source=embedded",
+            "debug=overfit",
+        ),
+        *("model=ridge", "preset.num_train=8", "task=evaluate", "~callbacks.best"),
+    )
+    assert settings(typed + kept, "small") == tuple(sorted(kept))
