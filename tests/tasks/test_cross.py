@@ -1,8 +1,12 @@
 import json
+from pathlib import Path
 
 import pytest
+from hydra import initialize_config_dir
 
-from ljn.tasks.cross import cross
+from ljn.tasks.cross import _composed, cross
+
+CONF = Path(__file__).parents[2] / "conf"
 
 
 def test_a_run_is_trained_once_and_tested_on_other_data(smoke_config, tmp_path):
@@ -37,6 +41,29 @@ def test_a_row_is_configured_as_the_experiment_that_it_trains(run_py, tmp_path):
     assert done.returncode == 1
     assert "task.trains: 'mesh/basic' has another model than this row" in done.stderr
     assert not (tmp_path / "runs").exists()
+
+
+def test_the_detector_of_a_chain_has_the_calls_sizes_and_machine_and_nothing_of_the_other_stage(monkeypatch):
+    typed = (
+        *("experiment=mesh/chain", "name=x", "seed=3", "debug=overfit", "body.genders=[male]", "tags=[a]"),
+        *("data.num_points=64", "data.num_workers=0", "trainer.precision=64", "paths.output_dir='a=b'"),
+        *(
+            "model.num_iterations=1",
+            "task.overrides=[]",
+            "data.initial_joints=noised",
+            "data.joint_noise_m=0.5",
+        ),
+        *("optimized_metric=val/apve", "callbacks.best.mode=max", "callbacks.pictures=null", "num_threads=1"),
+    )
+    monkeypatch.setattr("ljn.tasks.cross.typed_overrides", lambda: list(typed))
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        cfg = _composed("detector/proposed")
+    assert (cfg.seed, cfg.data.num_train, cfg.body.genders, cfg.tags) == (3, 8, ["male"], ["a"])
+    assert (cfg.data.num_points, cfg.data.num_workers, cfg.trainer.precision) == (64, 0, 64)
+    assert (cfg.paths.output_dir, cfg.callbacks.pictures, cfg.num_threads) == ("a=b", None, 1)
+    assert (cfg.data.initial_joints, cfg.data.joint_noise_m) == ("lifted", 0.02)
+    assert (cfg.optimized_metric, cfg.callbacks.best.mode) == ("val/mpjpe", "min")
+    assert cfg.task._target_ == "ljn.tasks.train.train"
 
 
 @pytest.mark.parametrize(
