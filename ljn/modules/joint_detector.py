@@ -16,9 +16,17 @@ from ljn.nets.yardsticks import Yardstick
 class JointDetector(StageModule):
     """A joint detector (`net`: a `Detector`) with its loss (Eq. 3.6), optimizer and metrics; see `StageModule`."""
 
+    stage = "detector"
     metrics = JointMetrics
     takes: ClassVar[type[nn.Module]] = Detector
+    truth = ("joints",)
+    stored = ("initial_joints", "pred_joints")
     net: Detector
+
+    @property
+    def is_root_relative(self) -> bool:
+        """See `StageModule.is_root_relative`."""
+        return self.net.is_root_relative
 
     def forward(self, points: Tensor, initial_joints: Tensor) -> Tensor:
         """Joints `(B, 24, 3)` from a cloud `(B, N, 6)` and initial joints `(B, 24, 3)`; metres, camera frame."""
@@ -29,16 +37,16 @@ class JointDetector(StageModule):
         return joint_loss(self(batch["points"], batch["initial_joints"]), batch["joints"])
 
     def evaluate(self, batch: Batch, metrics: Any) -> dict[str, Tensor]:
-        """See `StageModule.evaluate`; gives `pred_joints` `(B, 24, 3)`."""
+        """See `StageModule.evaluate`; predicts `pred_joints` `(B, 24, 3)`, metres, camera frame."""
         pred_joints = self(batch["points"], batch["initial_joints"])
-        metrics.update(
+        samples = metrics.update(
             pred_joints=pred_joints,
             joints=batch["joints"],
             initial_joints=batch["initial_joints"],
             noisy_keypoints_2d=batch["noisy_keypoints_2d"],
             keypoints_2d=batch["keypoints_2d"],
         )
-        return {"pred_joints": pred_joints}
+        return {"pred_joints": pred_joints, **samples}
 
 
 class YardstickDetector(JointDetector):
