@@ -111,7 +111,7 @@ def read_results(directory: Path) -> Results:
     sweep = read_sweep(directory)
     unknown = [name for name in sweep.tables if name not in TABLES]
     if unknown:
-        raise ValueError(f"tables: expected some of {', '.join(TABLES)}, got {', '.join(unknown)}")
+        raise ValueError(f"tables: expected some of {', '.join(TABLES)}, got {', '.join(unknown):.200}")
     tables = [TABLES[name] for name in sweep.tables]
     wanted = {row.experiment for table in tables for row in table.rows}
     others = [run for run in sweep.runs if run.experiment not in wanted or run.experiment is None]

@@ -8,6 +8,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf, open_dict
 
 from ljn.building import build
+from ljn.runs import layout
 from ljn.tasks.evaluate import apply_overrides, evaluate_checkpoint, typed_overrides
 from ljn.tasks.train import train
 from ljn.tasks.validation import validate
@@ -77,7 +78,7 @@ def _trained(cfg: DictConfig, name: str) -> Path:
         cfg.name = name
         cfg.rerun = False  # that of the evaluation is meant
     train(cfg)
-    return Path(cfg.paths.run_dir) / "checkpoints" / "best.ckpt"
+    return Path(cfg.paths.run_dir) / layout.BEST_CHECKPOINT
 
 
 def _composed(experiment: str) -> DictConfig:
