@@ -41,7 +41,7 @@ class JointMetrics(StageMetrics):
         noisy_keypoints_2d: Tensor,
         keypoints_2d: Tensor,
     ) -> dict[str, Tensor]:
-        """Add a batch; returns what `StageMetrics.add` does.
+        """Add a batch; see `StageMetrics.update`.
 
         Args:
             pred_joints: `(B, 24, 3)`, metres, camera frame.
@@ -50,12 +50,10 @@ class JointMetrics(StageMetrics):
             noisy_keypoints_2d: `(B, 24, 2)`, pixels.
             keypoints_2d: `(B, 24, 2)`, pixels, the truth.
         """
-        return self.add(
-            {
-                "pred_joints": pred_joints,
-                "joints": joints,
-                "initial_joints": initial_joints,
-                "noisy_keypoints_2d": noisy_keypoints_2d,
-                "keypoints_2d": keypoints_2d,
-            }
+        return super().update(
+            pred_joints=pred_joints,
+            joints=joints,
+            initial_joints=initial_joints,
+            noisy_keypoints_2d=noisy_keypoints_2d,
+            keypoints_2d=keypoints_2d,
         )

@@ -47,7 +47,7 @@ class MeshMetrics(StageMetrics):
         initial_joints: Tensor,
         joints: Tensor,
     ) -> dict[str, Tensor]:
-        """Add a batch, metres; returns what `StageMetrics.add` does.
+        """Add a batch, metres; see `StageMetrics.update`.
 
         Args:
             pred_vertices: `(B, V, 3)`, body frame.
@@ -76,4 +76,4 @@ class MeshMetrics(StageMetrics):
             for name in names:
                 placed = (tensors[name], tensors[root], camera_root)
                 tensors[f"{name}_camera"] = place_at_root(*(value.double() for value in placed))
-        return self.add(tensors)
+        return super().update(**tensors)

@@ -112,7 +112,7 @@ class Quantity:
 
 
 class StageMetrics(MetricCollection):
-    """Base: every metric of a stage under its key, for one split. A subclass has a table, and an `update` to fill it.
+    """Base: every metric of a stage under its key, for one split. A subclass names them in a table.
 
     Args:
         prefix: Put before every key, such as `"val/"`.
@@ -124,7 +124,7 @@ class StageMetrics(MetricCollection):
 
     def __init__(self, prefix: str | None = None) -> None:
         super().__init__(
-            {key: entry.reduction(entry.unit, entry.goal) for key, entry in self.table.items()},
+            {key: of.reduction(of.unit, of.goal) for key, of in self.table.items()},
             prefix=prefix,
             # Groups merge metrics whose first batch agrees, as mpjpe and initial_mpjpe do for an untrained
             # network with zero offsets; they would stay merged ever after.
@@ -132,13 +132,13 @@ class StageMetrics(MetricCollection):
         )
 
     @torch.no_grad()
-    def add(self, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    def update(self, **tensors: Tensor) -> dict[str, Tensor]:  # type: ignore[override]
         """Add a batch, given as the table's tensors by name; returns each sample's value of each metric, `(B,)`."""
         samples = {}
         metrics: Any = self.items(keep_base=True)
         for key, metric in metrics:
-            entry = self.table[key]
-            values = entry.formula(*(tensors[name] for name in entry.arguments))
+            quantity = self.table[key]
+            values = quantity.formula(*(tensors[name] for name in quantity.arguments))
             metric.update(values)
             samples[key] = metric.each(values)
         return samples
@@ -146,5 +146,5 @@ class StageMetrics(MetricCollection):
     @classmethod
     def describe(cls) -> dict[str, Any]:
         """Unit and goal of each metric, and which are the headline ones: goes into records."""
-        metrics = {key: {"unit": entry.unit, "goal": entry.goal} for key, entry in cls.table.items()}
+        metrics = {key: {"unit": of.unit, "goal": of.goal} for key, of in cls.table.items()}
         return {"metrics": metrics, "headline": list(cls.headline)}
