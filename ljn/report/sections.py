@@ -10,6 +10,7 @@ from typing import Any
 
 from PIL import Image
 
+from ljn.reading import READ_ERRORS
 from ljn.report.markup import MISSING, cell, column, facts, group, mono, table, text
 from ljn.report.results import Results
 from ljn.report.tables import NUM_DATA
@@ -101,9 +102,9 @@ def pictures(results: Results) -> str:
 def embed(path: Path) -> str | None:
     """A picture as a data URI, at most 1,600 pixels wide; None, with a warning, for a damaged one."""
     try:
-        with Image.open(path) as opened:
+        with Image.open(path, formats=("PNG",)) as opened:
             image = opened.convert("RGB")
-    except (OSError, ValueError, SyntaxError) as error:  # Pillow's PNG reader raises SyntaxError
+    except (*READ_ERRORS, Image.DecompressionBombError) as error:
         warnings.warn(f"'{path}' is left out of the report: {error}", stacklevel=2)
         return None
     if image.width > _MAX_PICTURE_PX:
