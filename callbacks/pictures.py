@@ -5,7 +5,7 @@ from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from functools import wraps
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
@@ -16,9 +16,10 @@ from torch import Tensor
 from callbacks.gathering import gather_samples
 from ljn.body.skeleton import ROOT
 from ljn.data import Batch
-from ljn.drawing import MeshSample, Sample, draw_meshes, draw_samples
+from ljn.drawing import MeshSample, Sample, clouds, draw_meshes, draw_samples
 from ljn.geometry.camera import place_at_root
 from ljn.metrics.functional import mpjpe
+from ljn.runs import layout
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -45,11 +46,16 @@ class Pictures(Callback):
     Files go below `directory`, and to W&B where it is among the loggers. A picture that cannot be drawn warns
     once and never stops a run.
 
+    Attributes:
+        inputs: Entries that are drawn of a batch which has them, too large to be kept of every test sample.
+
     Args:
         directory: Where pictures go.
         num_samples: Validation samples (the first ones) and test samples of each kind to draw.
         every_n_epochs: Epochs between two validation pictures.
     """
+
+    inputs: ClassVar[tuple[str, ...]]
 
     def __init__(self, directory: str | Path, num_samples: int = 4, every_n_epochs: int = 5) -> None:
         self.directory = Path(directory)
@@ -60,14 +66,14 @@ class Pictures(Callback):
         self._test: list[dict[str, Tensor]] = []
 
     @abstractmethod
-    def keep(self, outputs: dict[str, Tensor], batch: Batch, module: Any) -> dict[str, Tensor]:
-        """What a picture needs of a batch beside its points, small, and `error` `(B,)`, mm."""
+    def keep(self, outputs: dict[str, Tensor], batch: Any, module: Any) -> dict[str, Tensor]:
+        """What a picture needs of a batch beside its `inputs`, small, and `error` `(B,)`, in `unit`."""
 
     @abstractmethod
     def draw(
         self, samples: dict[str, Tensor], titles: Sequence[str], num_columns: int, module: Any
     ) -> "Figure":
-        """A page of samples: the rows of what was kept, and their `points` `(S, N, 3)`; all on the CPU."""
+        """A page of samples: the rows of what was kept, and their `inputs`; all on the CPU."""
 
     def unit(self, module: Any) -> str:
         """What follows an error in a title."""
@@ -79,7 +85,7 @@ class Pictures(Callback):
         trainer: Trainer,
         pl_module: LightningModule,
         outputs: Any,
-        batch: Batch,
+        batch: Any,
         batch_idx: int,
         dataloader_idx: int = 0,
     ) -> None:
@@ -88,8 +94,8 @@ class Pictures(Callback):
         is_wanted = trainer.is_global_zero and trainer.state.fn == TrainerFn.FITTING and self._is_due(trainer)
         if not is_wanted or missing <= 0:
             return
-        ids = {"sample_id": batch["sample_id"], "points": batch["points"][..., :3]}
-        kept = self.keep(outputs, batch, pl_module) | ids
+        kept = {name: batch[name] for name in ("sample_id", *self.inputs) if name in batch}
+        kept |= self.keep(outputs, batch, pl_module)
         self._validation.append({name: value[:missing].detach().cpu() for name, value in kept.items()})
 
     @_never_stops
@@ -103,7 +109,7 @@ class Pictures(Callback):
                 for number, error in zip(samples["sample_id"], samples["error"])
             ]
             figure = self.draw(samples, titles, self.num_samples, pl_module)
-            self._save(trainer, figure, "val/samples", f"val_epoch_{trainer.current_epoch + 1:03d}")
+            self._save(trainer, figure, "val/samples", f"val_epoch_{trainer.current_epoch + 1:03d}.png")
 
     @_never_stops
     def on_test_batch_end(
@@ -111,7 +117,7 @@ class Pictures(Callback):
         trainer: Trainer,
         pl_module: LightningModule,
         outputs: Any,
-        batch: Batch,
+        batch: Any,
         batch_idx: int,
         dataloader_idx: int = 0,
     ) -> None:
@@ -132,16 +138,16 @@ class Pictures(Callback):
         kinds = {"best": order[:number], "median": order[middle : middle + number], "worst": order[-number:]}
         chosen = [index for indices in kinds.values() for index in indices]
         drawn = {name: value[chosen] for name, value in samples.items()}
-        # Clouds are too large to keep: those of the chosen samples are read again.
         read: Any = trainer.test_dataloaders
-        drawn["points"] = read.dataset.__getitems__(drawn["sample_id"].tolist())["points"][..., :3]
+        again = read.dataset.__getitems__(drawn["sample_id"].tolist())
+        drawn |= {name: again[name] for name in self.inputs if name in again}
         titles = [
             f"{kind}: {float(samples['error'][index]):.0f} {self.unit(pl_module)}"
             for kind, indices in kinds.items()
             for index in indices
         ]
         figure = self.draw(drawn, titles, number, pl_module)
-        self._save(trainer, figure, "test/extremes", "test_best_median_worst")
+        self._save(trainer, figure, "test/extremes", layout.EXTREMES)
 
     def _is_due(self, trainer: Trainer) -> bool:
         epoch = trainer.current_epoch + 1
@@ -149,7 +155,7 @@ class Pictures(Callback):
 
     def _save(self, trainer: Trainer, figure: "Figure", key: str, name: str) -> None:
         self.directory.mkdir(parents=True, exist_ok=True)
-        path = self.directory / f"{name}.png"
+        path = self.directory / name
         figure.savefig(path)
         for logger in trainer.loggers:
             if isinstance(logger, WandbLogger):
@@ -162,27 +168,32 @@ class JointPictures(Pictures):
     Joints that only mean something beside the root are moved to the true root first.
     """
 
+    inputs = ("points", "crop", "crop_camera")
+
     def keep(self, outputs: dict[str, Tensor], batch: Batch, module: Any) -> dict[str, Tensor]:
         """See `Pictures.keep`."""
         pred_joints, joints = outputs["pred_joints"], batch["joints"]
-        if module.net.is_root_relative:
+        if module.is_root_relative:
             pred_joints = pred_joints + (joints - pred_joints)[:, ROOT, None]
         return {"error": mpjpe(pred_joints, joints), "pred_joints": pred_joints, "joints": joints}
 
     def unit(self, module: Any) -> str:
         """See `Pictures.unit`."""
-        return "mm, root-aligned" if module.net.is_root_relative else "mm"
+        return "mm, root-aligned" if module.is_root_relative else "mm"
 
     def draw(
         self, samples: dict[str, Tensor], titles: Sequence[str], num_columns: int, module: Any
     ) -> "Figure":
         """See `Pictures.draw`."""
-        columns = (samples[name].numpy() for name in ("points", "joints", "pred_joints"))
-        return draw_samples([Sample(*row) for row in zip(*columns, titles)], num_columns)
+        joints, pred_joints = samples["joints"].numpy(), samples["pred_joints"].numpy()
+        rows = zip(clouds(samples), joints, pred_joints, titles)
+        return draw_samples([Sample(*row) for row in rows], num_columns)
 
 
 class MeshPictures(Pictures):
     """Predicted (red) beside true (blue) meshes with the cloud over them, front and side; see `Pictures`."""
+
+    inputs = ("points", "crop", "crop_camera")
 
     def keep(self, outputs: dict[str, Tensor], batch: Batch, module: Any) -> dict[str, Tensor]:
         """See `Pictures.keep`: parameters and roots, from which the meshes are made again."""
@@ -210,7 +221,7 @@ class MeshPictures(Pictures):
         ):
             vertices, joints = layer(*(on_device[name] for name in names))
             meshes.append(place_at_root(vertices, joints[:, ROOT], on_device[root]).cpu().numpy())
-        rows = zip(samples["points"].numpy(), *meshes, titles)
+        rows = zip(clouds(samples), *meshes, titles)
         return draw_meshes([MeshSample(*row) for row in rows], module.body.faces.cpu().numpy(), num_columns)
 
 

@@ -14,14 +14,12 @@ class Progress(TQDMProgressBar):
 
     Args:
         metric: The validation metric to show.
-        unit: Its unit.
         refresh_rate: Batches between two refreshes of a bar.
     """
 
-    def __init__(self, metric: str = "val/mpjpe", unit: str = "mm", refresh_rate: int = 10) -> None:
+    def __init__(self, metric: str, refresh_rate: int = 10) -> None:
         super().__init__(refresh_rate=refresh_rate if sys.stdout.isatty() else 0)
         self.metric = metric
-        self.unit = unit
         self._samples = 0
         self._started = 0.0
         self._training_s = 0.0
@@ -36,7 +34,7 @@ class Progress(TQDMProgressBar):
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
         """Count the samples."""
-        self._samples += len(next(iter(batch.values()))) * trainer.world_size
+        self._samples += len(batch["sample_id"]) * trainer.world_size
         self._training_s = time.monotonic() - self._started
         self._loss = outputs.get("loss") if isinstance(outputs, dict) else None
         super().on_train_batch_end(trainer, pl_module, outputs, batch, batch_idx)
@@ -48,7 +46,7 @@ class Progress(TQDMProgressBar):
         if self._loss is not None:
             shown["loss"] = f"{float(self._loss):.4f}"
         if self.metric in trainer.callback_metrics:
-            shown[self.metric] = f"{float(trainer.callback_metrics[self.metric]):.1f} {self.unit}"
+            shown[self.metric] = self._value(trainer, pl_module)
         if self._training_s:
             shown["samples/s"] = round(self._samples / self._training_s)
         return shown
@@ -61,7 +59,13 @@ class Progress(TQDMProgressBar):
         if "train/loss" in metrics:
             parts.append(f"loss {float(metrics['train/loss']):.4f}")
         if self.metric in metrics:
-            parts.append(f"{self.metric} {float(metrics[self.metric]):.1f} {self.unit}")
+            parts.append(f"{self.metric} {self._value(trainer, pl_module)}")
         if self._training_s:
             parts.append(f"{self._samples / self._training_s:.0f} samples/s")
         trainer.print("  ".join(parts), flush=True)
+
+    def _value(self, trainer: Trainer, module: Any) -> str:
+        """The metric's last value, with its unit."""
+        value = f"{float(trainer.callback_metrics[self.metric]):.1f}"
+        quantity = module.metrics.table.get(self.metric.partition("/")[2])  # the loss is none
+        return f"{value} {quantity.unit}" if quantity else value

@@ -14,8 +14,9 @@ from hydra.types import RunMode
 from omegaconf import DictConfig
 
 from ljn.report import write_report
+from ljn.runs import layout
 from ljn.runs.files import read_json, write_json
-from ljn.runs.sweep import settings
+from ljn.runs.sweep import job_of, read_jobs, settings
 from ljn.tasks.processes import sweep_name
 
 
@@ -88,7 +89,7 @@ class SweepReport(Callback):
             return
         directory = self._gather(self._sweep)
         report = write_report(directory)
-        jobs = (read_json(directory / "sweep.json") or {})["jobs"]
+        jobs = read_jobs(directory)
         directories = {str(job["run_dir"]) for job in jobs if job["run_dir"]}
         num_runs = sum(run.startswith("runs") for run in directories)
         print(
@@ -98,7 +99,7 @@ class SweepReport(Callback):
         # Not above: Hydra imports this file for every call, also for one that should not load PyTorch.
         from ljn.tasks.tracking import log_table
 
-        with (directory / "table.csv").open(newline="", encoding="utf-8") as file:
+        with (directory / layout.TABLE_CSV).open(newline="", encoding="utf-8") as file:
             rows = [{name: _as_number(value) for name, value in row.items()} for row in csv.DictReader(file)]
         log_table(directory.name, rows, self._sweep.logger, directory)
 
@@ -110,12 +111,12 @@ class SweepReport(Callback):
         name, preset = sweep_name(config.hydra), config.preset.name
         directory = self.output_dir / "sweeps" / (name if name == preset else f"{name}-{preset}")
         directory.mkdir(parents=True, exist_ok=True)
-        jobs = [note for path in sorted(self._notes(config).glob("*.json")) if (note := read_json(path))]
+        notes = map(read_json, sorted(self._notes(config).glob("*.json")))
+        jobs = [job_of(note) for note in notes if note]
         # What earlier calls have done stays in the tables: other seeds, and what this call has not reached; what
         # failed, among this call's rows.
-        earlier = (read_json(directory / "sweep.json") or {}).get("jobs", [])
         rows, known = {_row(job, preset) for job in jobs}, {(_row(job, preset), job["seed"]) for job in jobs}
-        for job in earlier:
+        for job in read_jobs(directory):
             row = _row(job, preset)
             if (row, job["seed"]) not in known and (job["status"] == "complete" or row in rows):
                 jobs.append(job)
@@ -126,7 +127,7 @@ class SweepReport(Callback):
             "command": shlex.join(["python", "run.py", *sys.argv[1:]]),
             "jobs": jobs,
         }
-        write_json(directory / "sweep.json", content)
+        write_json(directory / layout.SWEEP, content)
         return directory
 
     def _relative(self, run_dir: str | None) -> str | None:

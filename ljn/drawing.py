@@ -1,12 +1,14 @@
 """Drawings of clouds, skeletons and depth images, without a display."""
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from ljn.body.skeleton import BONES
-from ljn.geometry.camera import Camera
+from ljn.geometry.camera import Camera, back_project
 from ljn.render.shading import shade_mesh
 
 if TYPE_CHECKING:
@@ -107,6 +109,22 @@ def _draw_view(axis: "Axes", sample: Sample, horizontal: int) -> None:
     axis.set_xlim(centre[horizontal] - half, centre[horizontal] + half)
     axis.set_ylim(centre[1] + half, centre[1] - half)  # y points down
     axis.set_aspect("equal")
+
+
+def clouds(batch: Mapping[str, Tensor]) -> list[np.ndarray]:
+    """What was seen of each sample of a batch as points `(N, 3)`, metres, camera frame: its cloud, or else its crop.
+
+    Of batches with neither, no points.
+    """
+    if "points" in batch:
+        return list(batch["points"][..., :3].numpy())
+    if "crop" not in batch:
+        return [np.empty((0, 3), np.float32)] * len(batch["sample_id"])
+    seen = []
+    for crop, camera in zip(batch["crop"], batch["crop_camera"]):
+        v, u = crop.nonzero(as_tuple=True)
+        seen.append(back_project(torch.stack([u, v], -1).float(), crop[v, u], camera).numpy())
+    return seen
 
 
 class MeshSample(NamedTuple):

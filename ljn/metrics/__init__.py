@@ -1,4 +1,4 @@
-"""Metrics: functional forms for each sample, and torchmetrics classes that gather them."""
+"""Metrics: functional forms for each sample, and torchmetrics that gather them over a split."""
 
 from ljn.metrics.functional import (
     apve,
@@ -14,48 +14,18 @@ from ljn.metrics.functional import (
     pckh_root_aligned,
     pckh_threshold_mm,
 )
-from ljn.metrics.joints import (
-    MPJPE,
-    JointMetrics,
-    MaxKeypointDistance,
-    MeanKeypointDistance,
-    MPJPEEq38,
-    PCKh,
-    PCKhThreshold,
-    ProcrustesMPJPE,
-    RootAlignedMPJPE,
-    RootAlignedPCKh,
-    SampleMax,
-    SampleMean,
-)
-from ljn.metrics.meshes import (
-    APVE,
-    MaxJointDistance,
-    MeanJointDistance,
-    MeshMetrics,
-    ProcrustesAPVE,
-    RootAlignedAPVE,
-)
+from ljn.metrics.joints import JointMetrics
+from ljn.metrics.meshes import MeshMetrics
+from ljn.metrics.samples import Quantity, SampleMax, SampleMean, SampleMetric, StageMetrics
 
 __all__ = [
-    "APVE",
-    "MPJPE",
     "JointMetrics",
-    "MPJPEEq38",
-    "MaxJointDistance",
-    "MaxKeypointDistance",
-    "MeanJointDistance",
-    "MeanKeypointDistance",
     "MeshMetrics",
-    "PCKh",
-    "PCKhThreshold",
-    "ProcrustesAPVE",
-    "ProcrustesMPJPE",
-    "RootAlignedAPVE",
-    "RootAlignedMPJPE",
-    "RootAlignedPCKh",
+    "Quantity",
     "SampleMax",
     "SampleMean",
+    "SampleMetric",
+    "StageMetrics",
     "apve",
     "apve_procrustes",
     "apve_root_aligned",

@@ -1,82 +1,41 @@
-"""The mesh regressor's metrics (section 3.7.2) as torchmetrics, right under DDP and any split into batches."""
+"""The mesh regressor's metrics (section 3.7.2)."""
+
+from typing import ClassVar
 
 from torch import Tensor
-from torchmetrics import MetricCollection
 
 from ljn.body.skeleton import ROOT
 from ljn.geometry.camera import place_at_root
 from ljn.metrics import functional
-from ljn.metrics.joints import MPJPE, MPJPEEq38, SampleMax, SampleMean
+from ljn.metrics.samples import Quantity, SampleMax, StageMetrics
+
+_MESHES = ("pred_vertices", "vertices")
+_SKELETONS = ("pred_body_joints", "body_joints")
+_INITIAL = ("initial_joints", "joints")
 
 
-class APVE(SampleMean):
-    """Eq. 3.9, mean error over all vertices, mm; see `functional.apve`."""
+class MeshMetrics(StageMetrics):
+    """Every metric of the mesh regressor under its key, for one split; see `StageMetrics`.
 
-    formula = staticmethod(functional.apve)
-
-
-class RootAlignedAPVE(SampleMean):
-    """Mean error over all vertices with the roots made to coincide, mm; see `functional.apve_root_aligned`."""
-
-    formula = staticmethod(functional.apve_root_aligned)
-
-
-class ProcrustesAPVE(SampleMean):
-    """Mean error over all vertices after the best similarity transform, mm; see `functional.apve_procrustes`."""
-
-    formula = staticmethod(functional.apve_procrustes)
-
-
-class MeanJointDistance(SampleMean):
-    """Mean distance of the initial joints from the true ones, mm; see `functional.joint_errors_mm`."""
-
-    higher_is_better = None
-    formula = staticmethod(functional.joint_errors_mm)
-
-
-class MaxJointDistance(SampleMax):
-    """Maximum distance of an initial joint from the true one, mm; see `functional.joint_errors_mm`."""
-
-    higher_is_better = None
-    formula = staticmethod(functional.joint_errors_mm)
-
-
-class MeshMetrics(MetricCollection):
-    """Every metric of the mesh regressor under its key, for one split; all in mm.
-
-    | key                        | of                                                                        |
-    |----------------------------|---------------------------------------------------------------------------|
-    | `apve`                     | vertices, body frame                                                      |
-    | `mpjpe`, `mpjpe_eq38`      | the mesh's joints, body frame                                             |
-    | `apve_root_aligned`        | vertices                                                                  |
-    | `apve_procrustes`          | vertices                                                                  |
-    | `apve_camera`              | vertices, camera frame, placed at the initial root (Eq. 4.2)              |
-    | `mpjpe_camera`             | the mesh's joints, likewise                                               |
-    | `floor_apve`               | the true pose on the predicted body, at the shape nearest to the true one |
-    | `initial_mean_distance_mm` | initial joints                                                            |
-    | `initial_max_distance_mm`  | initial joints                                                            |
-
-    Args:
-        prefix: put before every key, such as `"val/"`.
+    Vertices and the mesh's joints are in the body frame, and for `*_camera` in the camera frame, placed at the initial
+    root (Eq. 4.2). `floor_apve` is of the true pose on the predicted body, at the shape nearest to the true one.
     """
 
-    def __init__(self, prefix: str | None = None) -> None:
-        super().__init__(
-            {
-                "apve": APVE(),
-                "mpjpe": MPJPE(),
-                "mpjpe_eq38": MPJPEEq38(),
-                "apve_root_aligned": RootAlignedAPVE(),
-                "apve_procrustes": ProcrustesAPVE(),
-                "apve_camera": APVE(),
-                "mpjpe_camera": MPJPE(),
-                "floor_apve": APVE(),
-                "initial_mean_distance_mm": MeanJointDistance(),
-                "initial_max_distance_mm": MaxJointDistance(),
-            },
-            prefix=prefix,
-            compute_groups=False,  # see `JointMetrics`
-        )
+    table: ClassVar = {
+        "apve": Quantity(functional.apve, _MESHES),
+        "mpjpe": Quantity(functional.mpjpe, _SKELETONS),
+        "mpjpe_eq38": Quantity(functional.mpjpe_eq38, _SKELETONS),
+        "apve_root_aligned": Quantity(functional.apve_root_aligned, (*_MESHES, "pred_root", "root")),
+        "apve_procrustes": Quantity(functional.apve_procrustes, _MESHES),
+        "apve_camera": Quantity(functional.apve, ("pred_vertices_camera", "vertices_camera")),
+        "mpjpe_camera": Quantity(functional.mpjpe, ("pred_body_joints_camera", "body_joints_camera")),
+        "floor_apve": Quantity(functional.apve, ("floor_vertices", "vertices")),
+        "initial_mean_distance_mm": Quantity(functional.joint_errors_mm, _INITIAL, goal=None),
+        "initial_max_distance_mm": Quantity(
+            functional.joint_errors_mm, _INITIAL, goal=None, reduction=SampleMax
+        ),
+    }
+    headline = ("apve", "mpjpe")
 
     def update(  # type: ignore[override]
         self,
@@ -87,8 +46,8 @@ class MeshMetrics(MetricCollection):
         floor_vertices: Tensor,
         initial_joints: Tensor,
         joints: Tensor,
-    ) -> None:
-        """Add a batch; metres.
+    ) -> dict[str, Tensor]:
+        """Add a batch, metres; see `StageMetrics.update`.
 
         Args:
             pred_vertices: `(B, V, 3)`, body frame.
@@ -99,21 +58,22 @@ class MeshMetrics(MetricCollection):
             initial_joints: `(B, 24, 3)`, camera frame.
             joints: `(B, 24, 3)`, camera frame, the truth.
         """
-        pred_root, root = pred_body_joints[:, ROOT], body_joints[:, ROOT]
-        camera_roots = initial_joints[:, ROOT], joints[:, ROOT]
-        meshes, skeletons = (pred_vertices, vertices), (pred_body_joints, body_joints)
-        arguments: dict[str, tuple[Tensor, ...]] = {
-            "apve": meshes,
-            "mpjpe": skeletons,
-            "mpjpe_eq38": skeletons,
-            "apve_root_aligned": (*meshes, pred_root, root),
-            "apve_procrustes": meshes,
-            "floor_apve": (floor_vertices, vertices),
-            "initial_mean_distance_mm": (initial_joints, joints),
-            "initial_max_distance_mm": (initial_joints, joints),
+        tensors = {
+            "pred_vertices": pred_vertices,
+            "vertices": vertices,
+            "pred_body_joints": pred_body_joints,
+            "body_joints": body_joints,
+            "floor_vertices": floor_vertices,
+            "initial_joints": initial_joints,
+            "joints": joints,
+            "pred_root": pred_body_joints[:, ROOT],
+            "root": body_joints[:, ROOT],
         }
-        for name, pair in {"apve_camera": meshes, "mpjpe_camera": skeletons}.items():
-            placed = zip(pair, (pred_root, root), camera_roots)
-            arguments[name] = tuple(place_at_root(*(value.double() for value in values)) for values in placed)
-        for key, metric in self.items(keep_base=True):
-            metric.update(*arguments[key])
+        for names, root, camera_root in (
+            (("pred_vertices", "pred_body_joints"), "pred_root", initial_joints[:, ROOT]),
+            (("vertices", "body_joints"), "root", joints[:, ROOT]),
+        ):
+            for name in names:
+                placed = (tensors[name], tensors[root], camera_root)
+                tensors[f"{name}_camera"] = place_at_root(*(value.double() for value in placed))
+        return super().update(**tensors)

@@ -1,4 +1,4 @@
-"""What the two stages' LightningModules share: optimizer wiring, the check of the loss, logging of metrics."""
+"""What the stages' LightningModules share: optimizer wiring, the check of the loss, logging of metrics."""
 
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
@@ -10,13 +10,14 @@ from lightning.pytorch.utilities.types import OptimizerLRScheduler
 from torch import Tensor, nn
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
-from torchmetrics import MetricCollection
 
-from ljn.data import Batch
+from ljn.metrics import StageMetrics
 
 
 class StageModule(LightningModule):
     """Base of the LightningModules: a network with its loss, optimizer and metrics.
+
+    A batch is a mapping of tensors, a row a sample; of what is in it, every stage has `sample_id` `(B,)` alone.
 
     Args:
         net: The network.
@@ -27,10 +28,16 @@ class StageModule(LightningModule):
         ValueError: The network is not of this stage.
     """
 
-    metrics: ClassVar[Callable[..., MetricCollection]]
-    """Makes a split's metrics; its keys are what may be monitored."""
+    stage: ClassVar[str]
+    """What records and tables call the stage, such as `detector`."""
+    metrics: ClassVar[type[StageMetrics]]
+    """A split's metrics; their keys are what may be monitored."""
     net_type: ClassVar[type[nn.Module]]
     """What `net` must be."""
+    truth: ClassVar[tuple[str, ...]]
+    """Entries of a batch, stored of every test sample, by which samples of two runs are known to be the same."""
+    stored: ClassVar[tuple[str, ...]]
+    """Predictions and other entries of a batch that are stored of every test sample too."""
 
     def __init__(
         self,
@@ -47,8 +54,8 @@ class StageModule(LightningModule):
         self.net = net
         self._make_optimizer = optimizer
         self._make_scheduler = scheduler
-        self.val_metrics = type(self).metrics(prefix="val/")
-        self.test_metrics = type(self).metrics(prefix="test/")
+        self.val_metrics = self.metrics(prefix="val/")
+        self.test_metrics = self.metrics(prefix="test/")
 
     @property
     def takes(self) -> tuple[str, ...]:
@@ -64,13 +71,31 @@ class StageModule(LightningModule):
         """Hashes of the bodies that the module itself holds."""
         return ()
 
+    @property
+    def is_root_relative(self) -> bool:
+        """Whether only the predicted joints' positions beside the root mean something."""
+        return False
+
+    def describe(self) -> dict[str, Any]:
+        """What a run's record says of its stage, so that a report need not know it."""
+        return {
+            "stage": self.stage,
+            **self.metrics.describe(),
+            "truth": list(self.truth),
+            "is_root_relative": self.is_root_relative,
+        }
+
     @abstractmethod
-    def loss(self, batch: Batch) -> Tensor:
+    def loss(self, batch: Any) -> Tensor:
         """Scalar loss of a batch."""
 
     @abstractmethod
-    def evaluate(self, batch: Batch, metrics: MetricCollection) -> dict[str, Tensor]:
-        """Update a split's metrics with a batch; returns the predictions for callbacks."""
+    def evaluate(self, batch: Any, metrics: Any) -> dict[str, Tensor]:
+        """Update a split's metrics with a batch.
+
+        Returns:
+            For callbacks: the predictions, and each sample's value of each metric under its key, `(B,)` float64.
+        """
 
     def configure_optimizers(self) -> OptimizerLRScheduler:
         """The optimizer and, stepped once an epoch, the scheduler."""
@@ -81,8 +106,8 @@ class StageModule(LightningModule):
             return optimizer
         return {"optimizer": optimizer, "lr_scheduler": self._make_scheduler(optimizer)}
 
-    def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
-        """Loss of a batch, m^2."""
+    def training_step(self, batch: Any, batch_idx: int) -> Tensor:
+        """Loss of a batch."""
         loss = self.loss(batch)
         if not bool(torch.isfinite(loss)):
             raise FloatingPointError(
@@ -90,20 +115,20 @@ class StageModule(LightningModule):
                 "learning rate, or check the data (samples "
                 f"{batch['sample_id'].tolist()})"
             )
-        size = len(batch["joints"])
+        size = len(batch["sample_id"])
         self.log("train/loss", loss, on_step=False, on_epoch=True, batch_size=size, sync_dist=True)
         return loss
 
-    def validation_step(self, batch: Batch, batch_idx: int) -> dict[str, Tensor]:
-        """Update the metrics; returns the predictions for callbacks."""
+    def validation_step(self, batch: Any, batch_idx: int) -> dict[str, Tensor]:
+        """See `evaluate`."""
         return self.evaluate(batch, self.val_metrics)
 
     def on_validation_epoch_end(self) -> None:
         """Log the metrics of the validation set."""
         self._log_metrics(self.val_metrics)
 
-    def test_step(self, batch: Batch, batch_idx: int) -> dict[str, Tensor]:
-        """Update the metrics; returns the predictions for callbacks."""
+    def test_step(self, batch: Any, batch_idx: int) -> dict[str, Tensor]:
+        """See `evaluate`."""
         return self.evaluate(batch, self.test_metrics)
 
     def on_test_epoch_end(self) -> None:

@@ -16,25 +16,33 @@ from ljn.nets.yardsticks import Yardstick
 class JointDetector(StageModule):
     """A joint detector (`net`: a `Detector`) with its loss (Eq. 3.6), optimizer and metrics; see `StageModule`."""
 
+    stage = "detector"
     metrics = JointMetrics
     net_type: ClassVar[type[nn.Module]] = Detector
+    truth = ("joints",)
+    stored = ("initial_joints", "pred_joints")
     net: Detector
+
+    @property
+    def is_root_relative(self) -> bool:
+        """See `StageModule.is_root_relative`."""
+        return self.net.is_root_relative
 
     def loss(self, batch: Batch) -> Tensor:
         """See `StageModule.loss`."""
         return joint_loss(self(batch), batch["joints"])
 
     def evaluate(self, batch: Batch, metrics: Any) -> dict[str, Tensor]:
-        """See `StageModule.evaluate`; gives `pred_joints` `(B, 24, 3)`."""
+        """See `StageModule.evaluate`; predicts `pred_joints` `(B, 24, 3)`, metres, camera frame."""
         pred_joints = self(batch)
-        metrics.update(
+        samples = metrics.update(
             pred_joints=pred_joints,
             joints=batch["joints"],
             initial_joints=batch["initial_joints"],
             keypoints=batch["keypoints"],
             true_keypoints=batch["true_keypoints"],
         )
-        return {"pred_joints": pred_joints}
+        return {"pred_joints": pred_joints, **samples}
 
 
 class YardstickDetector(JointDetector):

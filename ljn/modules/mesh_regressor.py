@@ -15,7 +15,7 @@ from ljn.data import Batch
 from ljn.geometry.camera import place_at_root
 from ljn.geometry.rotations import rotmat_to_rotvec
 from ljn.losses import mesh_loss
-from ljn.metrics import MeshMetrics, apve
+from ljn.metrics import MeshMetrics
 from ljn.modules.base import StageModule
 from ljn.nets.body_network import BodyNetwork
 
@@ -35,8 +35,11 @@ class MeshRegressor(StageModule):
         predicted: Gender of the body that predictions are meshes of.
     """
 
+    stage = "mesh"
     metrics = MeshMetrics
     net_type = BodyNetwork
+    truth = ("joints",)
+    stored = ("initial_joints", "pred_joints", "pred_pose", "pred_betas")
     net: BodyNetwork
 
     def __init__(
@@ -70,14 +73,14 @@ class MeshRegressor(StageModule):
     def evaluate(self, batch: Batch, metrics: Any) -> dict[str, Tensor]:
         """See `StageModule.evaluate`.
 
-        Gives, all for the last iteration, `pred_vertices` `(B, V, 3)`, `pred_joints` `(B, 24, 3)` and `vertices`
-        (the truth), in the camera frame, metres, the prediction placed at the initial root (Eq. 4.2);
-        `pred_pose` `(B, 72)` and `pred_betas` `(B, 10)`; and each sample's `apve` `(B,)`, mm, body frame.
+        Predicts, all for the last iteration, `pred_vertices` `(B, V, 3)`, `pred_joints` `(B, 24, 3)` and gives
+        `vertices` (the truth), in the camera frame, metres, the prediction placed at the initial root (Eq. 4.2);
+        `pred_pose` `(B, 72)` and `pred_betas` `(B, 10)`.
         """
         rotmats, betas = (values[-1] for values in self(batch))
         pred_vertices, pred_joints = self.body.from_rotmats(rotmats, betas)
         vertices, joints = self.target(batch)
-        metrics.update(
+        samples = metrics.update(
             pred_vertices=pred_vertices,
             vertices=vertices,
             pred_body_joints=pred_joints,
@@ -93,7 +96,7 @@ class MeshRegressor(StageModule):
             "vertices": place_at_root(vertices, joints[:, ROOT], batch["joints"][:, ROOT]),
             "pred_pose": rotmat_to_rotvec(rotmats).flatten(-2),
             "pred_betas": betas,
-            "apve": apve(pred_vertices, vertices),
+            **samples,
         }
 
     def _floor(self, batch: Batch) -> Tensor:

@@ -8,6 +8,7 @@ from ljn.report.page import to_html
 from ljn.report.results import Results, read_results
 from ljn.report.tables import TABLES
 from ljn.report.writers import to_csv, to_latex, to_markdown, to_text
+from ljn.runs import layout
 
 __all__ = ["TABLES", "Report", "Results", "read_results", "write_report"]
 
@@ -42,12 +43,12 @@ def write_report(directory: Path, is_final: bool = True) -> Report:
     """
     results = read_results(directory)
     contents = {
-        "table.csv": to_csv(results),
-        "table.md": to_markdown(results),
-        "table.tex": to_latex(results),
+        layout.TABLE_CSV: to_csv(results),
+        layout.TABLE_MARKDOWN: to_markdown(results),
+        layout.TABLE_LATEX: to_latex(results),
     }
     if is_final:
-        contents["report.html"] = to_html(results)
+        contents[layout.PAGE] = to_html(results)
     paths = []
     for name, content in contents.items():
         path = directory / name
@@ -57,4 +58,4 @@ def write_report(directory: Path, is_final: bool = True) -> Report:
         draft.write_text(content, encoding="utf-8")
         draft.replace(path)
         paths.append(path)
-    return Report(to_text(results), bool(results.failed or results.missing), tuple(paths))
+    return Report(to_text(results), bool(results.lost), tuple(paths))

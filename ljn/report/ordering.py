@@ -7,7 +7,7 @@ from itertools import combinations
 
 import numpy as np
 
-from ljn.report.tables import Column
+from ljn.report.tables import ROOT_ALIGNED, Column
 from ljn.runs.sweep import Run
 
 NUM_RESAMPLES = 1000
@@ -15,24 +15,38 @@ _SEED = 0
 
 
 @dataclass(frozen=True)
-class Contender:
-    """A row's result in one column, to be compared.
+class Cell:
+    """A number of a table, in its column's unit.
 
     Attributes:
-        label: The row.
-        metric: The metric that is shown; None for none.
-        mean: Over seeds, in the column's unit; None without a result.
-        sd: Over seeds; None of fewer than two.
+        column: Its column.
+        label: Its row.
+        runs: Whose result it is, one for each seed.
+        metric: The metric that is shown; None where the row has no such value.
+        mean: Over seeds; None without a result.
+        sd: Standard deviation over seeds (one degree of freedom less); None of fewer than two.
+        num_seeds: How many there are.
         thesis: The thesis's value.
-        runs: Whose result it is.
     """
 
+    column: Column
     label: str
+    runs: tuple[Run, ...]
     metric: str | None
     mean: float | None
     sd: float | None
+    num_seeds: int
     thesis: float | None
-    runs: tuple[Run, ...]
+
+    @property
+    def is_substituted(self) -> bool:
+        """Whether it is of joints whose roots were moved to the same place, unlike the column's metric."""
+        return self.metric != self.column.metric and self.metric in ROOT_ALIGNED.values()
+
+    @property
+    def difference(self) -> float | None:
+        """Ours less the thesis's."""
+        return None if self.mean is None or self.thesis is None else self.mean - self.thesis
 
 
 @dataclass(frozen=True)
@@ -47,7 +61,7 @@ class Comparison:
         is_adjacent: Whether no row of the thesis lies between the two.
         lead: By how much the first is better in our runs, in the column's unit; negative where it is worse.
         spread: Standard deviation of the lead over seeds; None where a row has fewer than two.
-        interval: 95 % interval of the lead over test samples, by a paired bootstrap; None where the errors of the
+        interval: 95 % interval of the lead over test samples, by a paired bootstrap; None where its values of the
             same samples are not known for both.
     """
 
@@ -71,47 +85,45 @@ class Comparison:
         return None if self.spread is None else abs(self.lead) > self.spread
 
 
-def compare(columns: Sequence[Column], contenders: Sequence[Sequence[Contender]]) -> tuple[Comparison, ...]:
+def compare(columns: Sequence[Sequence[Cell]]) -> tuple[Comparison, ...]:
     """The comparisons of a table.
 
     Args:
-        columns: Its columns; those without a goal are not compared.
-        contenders: For each column, its rows.
+        columns: Its columns' cells; columns without a goal are not compared.
 
     Returns:
         Where the thesis has numbers, all pairs of rows that it puts in an order and that have results; where it has
         none for any row of the table, our best row and each other one.
     """
+    is_claim = any(cell.thesis is not None for cells in columns for cell in cells)
     comparisons: list[Comparison] = []
-    main = next((column for column in columns if column.goal), None)
-    is_claim = any(row.thesis is not None for rows in contenders for row in rows)
-    for column, rows in zip(columns, contenders):
-        if column.goal is None:
+    has_main = False
+    for cells in columns:
+        if not cells or (goal := cells[0].column.goal) is None:
             continue
-        pairs = _claims(column, rows) if is_claim else _best_and_others(column, rows)
-        for better, worse, is_adjacent in pairs:
-            assert better.mean is not None
-            assert worse.mean is not None
-            lead = worse.mean - better.mean if column.goal == "min" else better.mean - worse.mean
+        sign = -1 if goal == "max" else 1
+        for better, worse, is_adjacent in _claims(cells, sign) if is_claim else _best_and_others(cells, sign):
+            if better.mean is None or worse.mean is None:
+                continue
             comparisons.append(
                 Comparison(
-                    column=column,
+                    column=better.column,
                     better=better.label,
                     worse=worse.label,
                     is_claim=is_claim,
                     is_adjacent=is_adjacent,
-                    lead=lead,
+                    lead=sign * (worse.mean - better.mean),
                     spread=None if better.sd is None or worse.sd is None else math.hypot(better.sd, worse.sd),
-                    interval=_interval(better, worse) if column is main else None,
+                    interval=None if has_main else _interval(better, worse, sign),
                 )
             )
+        has_main = True
     return tuple(comparisons)
 
 
-def count_claims(column: Column, rows: Sequence[Contender]) -> int:
+def count_claims(cells: Sequence[Cell]) -> int:
     """How many pairs of rows the thesis puts in an order in a column, with results or without."""
-    known = [row.thesis for row in rows if row.thesis is not None]
-    return sum(first != second for first, second in combinations(known, 2)) if column.goal else 0
+    return len(list(_claims(cells, 1))) if cells and cells[0].column.goal else 0
 
 
 def verdict(comparisons: Sequence[Comparison], num_claims: int) -> tuple[bool | None, str]:
@@ -142,13 +154,13 @@ def paired_bootstrap(
     """The 95 % interval of the mean of `worse - better` over test samples.
 
     Args:
-        better: `(S,)`, errors, mm.
-        worse: `(S,)`, errors of the same samples, mm.
+        better: `(S,)`, a metric of which less is better.
+        worse: `(S,)`, of the same samples.
         num_resamples: How often the samples are drawn anew, with replacement.
         seed: Of the drawing.
 
     Returns:
-        Its 2.5th and 97.5th percentile, mm.
+        Its 2.5th and 97.5th percentile, in the metric's unit.
     """
     differences = np.asarray(worse, np.float64) - np.asarray(better, np.float64)
     generator = np.random.default_rng(seed)
@@ -158,51 +170,43 @@ def paired_bootstrap(
     return float(low), float(high)
 
 
-def _claims(column: Column, rows: Sequence[Contender]) -> Iterator[tuple[Contender, Contender, bool]]:
+def _claims(cells: Sequence[Cell], sign: int) -> Iterator[tuple[Cell, Cell, bool]]:
     """Pairs that the thesis puts in an order, the better one first, and whether none lies between them."""
-    sign = -1 if column.goal == "max" else 1
-    known = [row for row in rows if row.thesis is not None]
-    ranked = sorted(known, key=lambda row: sign * (row.thesis or 0.0))
-    levels = sorted({sign * (row.thesis or 0.0) for row in known})
+    ranks = {id(cell): sign * cell.thesis for cell in cells if cell.thesis is not None}
+    levels = sorted(set(ranks.values()))
+    ranked = sorted((cell for cell in cells if id(cell) in ranks), key=lambda cell: ranks[id(cell)])
     for better, worse in combinations(ranked, 2):
-        if better.thesis == worse.thesis or better.mean is None or worse.mean is None:
-            continue
-        ranks = [levels.index(sign * (row.thesis or 0.0)) for row in (better, worse)]
-        yield better, worse, ranks[1] - ranks[0] == 1
+        first, second = (levels.index(ranks[id(cell)]) for cell in (better, worse))
+        if first != second:
+            yield better, worse, second - first == 1
 
 
-def _best_and_others(
-    column: Column, rows: Sequence[Contender]
-) -> Iterator[tuple[Contender, Contender, bool]]:
-    known = [row for row in rows if row.mean is not None and math.isfinite(row.mean)]
-    if not known:
-        return
-    sign = -1 if column.goal == "max" else 1
-    best = min(known, key=lambda row: sign * (row.mean or 0.0))
-    for row in known:
-        if row is not best:
-            yield best, row, False
+def _best_and_others(cells: Sequence[Cell], sign: int) -> Iterator[tuple[Cell, Cell, bool]]:
+    known = [cell for cell in cells if cell.mean is not None and math.isfinite(cell.mean)]
+    best = min(known, key=lambda cell: sign * (cell.mean or 0.0), default=None)
+    for cell in known:
+        if best is not None and cell is not best:
+            yield best, cell, False
 
 
-def _interval(better: Contender, worse: Contender) -> tuple[float, float] | None:
-    first, second = _mean_errors(better), _mean_errors(worse)
+def _interval(better: Cell, worse: Cell, sign: int) -> tuple[float, float] | None:
+    first, second = _mean_values(better), _mean_values(worse)
     if first is None or second is None or not len(first[0]) or not _are_same(first[0], second[0]):
         return None
-    return paired_bootstrap(first[1], second[1])
+    return paired_bootstrap(sign * first[1], sign * second[1])
 
 
-def _mean_errors(row: Contender) -> tuple[np.ndarray, np.ndarray] | None:
-    """A row's samples and their errors (mm), each sample's mean over the runs; see `Run.sample_errors`."""
-    if row.metric is None:
+def _mean_values(cell: Cell) -> tuple[np.ndarray, np.ndarray] | None:
+    """A row's samples and their values, each sample's mean over the runs; see `Run.sample_values`."""
+    complete = [run for run in cell.runs if run.status == "complete"]
+    values = [run.sample_values(cell.metric) for run in complete] if cell.metric else []
+    known = [entry for entry in values if entry is not None]
+    if not known or len(known) < len(values):
         return None
-    found = [run.sample_errors(row.metric) for run in row.runs if run.status == "complete"]
-    errors = [entry for entry in found if entry is not None]
-    if not errors or len(errors) < len(found):
+    samples = known[0][0]
+    if any(not _are_same(other, samples) for other, _ in known):
         return None
-    samples = errors[0][0]
-    if any(not _are_same(other, samples) for other, _ in errors):
-        return None
-    return samples, np.mean([values for _, values in errors], axis=0)
+    return samples, np.mean([entry for _, entry in known], axis=0)
 
 
 def _are_same(first: np.ndarray, second: np.ndarray) -> bool:

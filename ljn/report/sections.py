@@ -3,41 +3,27 @@
 import base64
 import io
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from html import escape
 from pathlib import Path
 from typing import Any
 
 from PIL import Image
 
+from ljn.reading import READ_ERRORS
+from ljn.report.markup import MISSING, cell, column, facts, group, mono, table, text
 from ljn.report.results import Results
 from ljn.report.tables import NUM_DATA
 from ljn.report.writers import NONE
-from ljn.runs.sweep import Run
+from ljn.runs.sweep import Run, mapping
 
 _MAX_PICTURE_PX = 1600
-_MISSING = '<span class="word">missing</span>'
 _SPLITS = {"train": "train", "val": "validation", "test": "test"}
 _COUNTS_NOTE = (
     "Thesis: Table 3.1, SURREAL and the samples taken of it; its validation set is a part of its test set. Ours: the "
     "motion capture that poses are taken and recombined from, where it is known (procedural poses need none); each "
     "sample is a pose and a shape of the split's pool."
 )
-
-
-def text(value: Any) -> str:
-    """A value for HTML; the word `missing` for none."""
-    return _MISSING if value is None or value == "" else escape(str(value))
-
-
-def mono(value: Any) -> str:
-    """A hash or a name for HTML; the word `missing` for none."""
-    return _MISSING if value is None or value == "" else f'<span class="mono">{escape(str(value))}</span>'
-
-
-def scroll(table: str, label: str) -> str:
-    """A table in a box of its own, which scrolls where the page is narrow, also from the keyboard."""
-    return f'<div class="scroll" role="region" aria-label="{escape(label, quote=True)}" tabindex="0">{table}</div>'
 
 
 def data(runs: Sequence[Run]) -> str:
@@ -48,59 +34,53 @@ def data(runs: Sequence[Run]) -> str:
             same = [run.data.get(key) for key in ("source", "version", "sizes", "pool", "licence", "bodies")]
             groups.setdefault(repr(same), []).append(run)
     if not groups:
-        return f"<p>{_MISSING}: no run left a record of its data.</p>"
+        return f"<p>{MISSING}: no run left a record of its data.</p>"
     parts = []
-    for group in groups.values():
-        facts = group[0].data
-        bodies = ", ".join(map(str, _dict(facts.get("bodies"))))
-        listed = {"source": facts.get("source"), "version": facts.get("version"), "bodies": bodies}
-        parts.append(
-            '<dl class="facts">'
-            + "".join(f"<div><dt>{name}</dt><dd>{text(value)}</dd></div>" for name, value in listed.items())
-            + "</dl>"
-            + scroll(_counts(group), "Numbers of data")
-            + f'<p class="notes">{text(facts.get("licence"))}</p>'
-        )
+    for same_data in groups.values():
+        about = same_data[0].data
+        bodies = ", ".join(map(str, mapping(about.get("bodies"))))
+        listed = {"source": about.get("source"), "version": about.get("version"), "bodies": bodies}
+        licence = text(about.get("licence"))
+        parts.append(f'{facts(listed)}{_counts(same_data)}<p class="notes">{licence}</p>')
     return "".join(parts) + f'<p class="notes">{_COUNTS_NOTE}</p>'
 
 
 def _counts(runs: Sequence[Run]) -> str:
     """The table of the counts of runs of equal data; older records do not say what the poses are made from."""
-    facts = runs[0].data
-    sizes, pool = _dict(facts.get("sizes")), _dict(facts.get("pool"))
-    motion = next((found for run in runs if (found := _dict(run.data.get("motion")))), {})
-    own = {split: {**_dict(motion.get(split)), "samples": sizes.get(split)} for split in NUM_DATA}
+    about = runs[0].data
+    sizes, pool = mapping(about.get("sizes")), mapping(about.get("pool"))
+    motion = next((known for run in runs if (known := mapping(run.data.get("motion")))), {})
+    ours = {split: {**mapping(motion.get(split)), "samples": sizes.get(split)} for split in NUM_DATA}
     groups, columns, cells = ["<th></th>"], ["<th></th>"], dict.fromkeys(NUM_DATA, "")
     for name in NUM_DATA["train"]:
-        has_own = name == "samples" or any(counts.get(name) is not None for counts in own.values())
-        names = ("thesis", "ours") if has_own else ("thesis",)
-        groups.append(f'<th scope="colgroup" colspan="{len(names)}"><span>{name}</span></th>')
-        columns += [f'<th scope="col">{title}</th>' for title in names]
-        for split, counts in own.items():
+        has_ours = name == "samples" or any(counts.get(name) is not None for counts in ours.values())
+        names = ("thesis", "ours") if has_ours else ("thesis",)
+        groups.append(group(name, len(names)))
+        columns += map(column, names)
+        for split, counts in ours.items():
             cells[split] += _cell(NUM_DATA[split].get(name), "thesis")
-            cells[split] += _cell(counts.get(name), "ours") if has_own else ""
+            cells[split] += _cell(counts.get(name), "ours") if has_ours else ""
     groups.append("<th></th>")
-    columns.append('<th scope="col" class="text">hash of the pool of poses</th>')
-    rows = "".join(
+    columns.append(column("hash of the pool of poses", "text"))
+    rows = [
         f'<tr><th scope="row">{_SPLITS[split]}</th>{row}'
-        f'<td class="text">{mono(pool[split]) if pool.get(split) else NONE}</td></tr>'
+        f"{cell(mono(pool[split]) if pool.get(split) else NONE, 'text')}</tr>"
         for split, row in cells.items()
-    )
-    return (
-        f"<table><caption>{len(runs)} run{'s' * (len(runs) > 1)}</caption>"
-        f"<thead><tr>{''.join(groups)}</tr><tr>{''.join(columns)}</tr></thead><tbody>{rows}</tbody></table>"
+    ]
+    return table(
+        "Numbers of data", (groups, columns), rows, caption=f"{len(runs)} run{'s' * (len(runs) > 1)}"
     )
 
 
 def _cell(value: Any, style: str) -> str:
-    return f'<td class="none">{NONE}</td>' if value is None else f'<td class="{style}">{_count(value)}</td>'
+    return cell(NONE, "none") if value is None else cell(_count(value), style)
 
 
 def pictures(results: Results) -> str:
     """The best, median and worst test samples: one page of them for each row, of its first seed."""
     figures: dict[Path, str] = {}
-    for table in results.tables:
-        for row in table.rows:
+    for result in results.tables:
+        for row in result.rows:
             path = next((run.picture for run in row.runs if run.picture is not None), None)
             if path is None or path in figures or row.is_shared:
                 continue
@@ -115,16 +95,17 @@ def pictures(results: Results) -> str:
                 f'<img src="{source}" alt="{alt}"></div></figure>'
             )
     if not figures:
-        return f"<p>{_MISSING}: no run left a picture.</p>"
+        return f"<p>{MISSING}: no run left a picture.</p>"
     return f'<div class="pictures">{"".join(figures.values())}</div>'
 
 
 def embed(path: Path) -> str | None:
     """A picture as a data URI, at most 1,600 pixels wide; None, with a warning, for a damaged one."""
+    unreadable: tuple[type[Exception], ...] = (Image.DecompressionBombError, *READ_ERRORS)
     try:
-        with Image.open(path) as opened:
+        with Image.open(path, formats=("PNG",)) as opened:
             image = opened.convert("RGB")
-    except (OSError, ValueError, SyntaxError) as error:  # Pillow's PNG reader raises SyntaxError
+    except unreadable as error:
         warnings.warn(f"'{path}' is left out of the report: {error}", stacklevel=2)
         return None
     if image.width > _MAX_PICTURE_PX:
@@ -141,7 +122,6 @@ def provenance(runs: Sequence[Run]) -> str:
         "run", "seed", "status", "preset", "config", "commit", "data", "bodies", "overrides", "parameters",
         "time", "device", "started", "versions",
     )  # fmt: skip
-    head = "".join(f'<th scope="col" class="text">{name}</th>' for name in columns)
     rows = []
     for number, run in enumerate(runs):
         record = run.record
@@ -153,9 +133,10 @@ def provenance(runs: Sequence[Run]) -> str:
             _commit(record),
             _data(run),
             "<br>".join(
-                f"{escape(str(name))} {mono(value)}" for name, value in _dict(run.data.get("bodies")).items()
+                f"{escape(str(name))} {mono(value)}"
+                for name, value in mapping(run.data.get("bodies")).items()
             )
-            or _MISSING,
+            or MISSING,
             mono(" ".join(run.overrides)) if run.overrides else "none",
             _count(record.get("num_parameters"))
             if record.get("num_parameters") is not None
@@ -163,38 +144,32 @@ def provenance(runs: Sequence[Run]) -> str:
             _duration(record.get("wall_time_s")),
             text(record.get("device")),
             text(record.get("started")),
-            escape(", ".join(f"{key} {value}" for key, value in _dict(record.get("versions")).items()))
-            or _MISSING,
+            escape(", ".join(f"{key} {value}" for key, value in mapping(record.get("versions")).items()))
+            or MISSING,
         )
-        body = "".join(f'<td class="text">{cell}</td>' for cell in cells)
+        body = "".join(cell(value, "text") for value in cells)
         sub = f'<span class="sub">{escape(run.experiment)}</span>' if run.experiment else ""
         rows.append(f'<tr id="run-{number}"><th scope="row">{mono(run.name)}{sub}</th>{body}</tr>')
-    table = (
-        f'<table class="wide"><caption>Every number above is the mean over its row\'s runs.</caption>'
-        f"<thead><tr>{head}</tr></thead><tbody>{''.join(rows)}</tbody></table>"
-    )
-    return scroll(table, "Runs")
-
-
-def common(runs: Iterable[Run], key: str) -> str:
-    """What all records say under a key; several values one after the other."""
-    values = {str(run.record[key]) for run in runs if run.record.get(key) is not None}
-    return ", ".join(sorted(values))
+    head = [column(name, "text") for name in columns]
+    caption = "Every number above is the mean over its row's runs."
+    return table("Runs", (head,), rows, caption=caption, style="wide")
 
 
 def _commit(record: Mapping[str, Any]) -> str:
     commit = record.get("commit")
     if not commit:
-        return _MISSING
-    dirty = {True: ", with changes", False: ", clean"}.get(record.get("is_dirty"), "")  # type: ignore[arg-type]
-    return f"{mono(str(commit)[:10])}{dirty}"
+        return MISSING
+    is_dirty = record.get("is_dirty")
+    return mono(str(commit)[:10]) + (
+        ", with changes" if is_dirty is True else ", clean" if is_dirty is False else ""
+    )
 
 
 def _data(run: Run) -> str:
     if not run.data:
-        return _MISSING
+        return MISSING
     version = run.data.get("version")
-    detector = _dict(run.data.get("detector")).get("hash")
+    detector = mapping(run.data.get("detector")).get("hash")
     parts = [
         f"{text(run.data.get('source'))} v{escape(str(version))}"
         if version is not None
@@ -209,15 +184,15 @@ def _data(run: Run) -> str:
 def _trained_by(record: Mapping[str, Any]) -> str:
     """Of an evaluation: whose checkpoint it evaluates."""
     if not record.get("trained_by"):
-        return _MISSING
-    checkpoint = _dict(record.get("checkpoint"))
+        return MISSING
+    checkpoint = mapping(record.get("checkpoint"))
     place = f"epoch {text(checkpoint.get('epoch'))}, {mono(checkpoint.get('hash'))}"
     return f"those of {mono(record['trained_by'])}<br>{place}"
 
 
 def _duration(seconds: Any) -> str:
     if not isinstance(seconds, int | float):
-        return _MISSING
+        return MISSING
     minutes, rest = divmod(round(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours} h {minutes:02d} min" if hours else f"{minutes} min {rest:02d} s"
@@ -225,7 +200,3 @@ def _duration(seconds: Any) -> str:
 
 def _count(value: Any) -> str:
     return f"{value:,}" if isinstance(value, int) else text(value)
-
-
-def _dict(value: Any) -> Mapping[str, Any]:
-    return value if isinstance(value, Mapping) else {}

@@ -28,8 +28,8 @@ class Column:
 
     @property
     def heading(self) -> str:
-        """Label and unit."""
-        return f"{self.label}, {self.unit}"
+        """Label and unit, if it has one."""
+        return f"{self.label}, {self.unit}" if self.unit else self.label
 
 
 @dataclass(frozen=True)
@@ -104,9 +104,9 @@ class Table:
     notes: tuple[str, ...] = ()
 
 
-APVE = Column("apve", "APVE", "mm", "min")
-MPJPE = Column("mpjpe", "MPJPE", "mm", "min")
-PCKH = Column("pckh", "PCKh", "%", "max")
+_APVE = Column("apve", "APVE", "mm", "min")
+_MPJPE = Column("mpjpe", "MPJPE", "mm", "min")
+_PCKH = Column("pckh", "PCKh", "%", "max")
 _MPJPE_EQ38 = Column("mpjpe_eq38", "MPJPE", "mm", "min")
 _MAX_PX = Column("initial_max_distance_px", "max. distance", "px")
 _MEAN_PX = Column("initial_mean_distance_px", "mean distance", "px")
@@ -134,8 +134,8 @@ _NOISE_2D = Axis("σ of the 2D joints' noise, px", "data.synthesis.keypoint_nois
 _NOISE_3D = Axis("σ of the 3D joints' noise, m", "data.synthesis.joint_noise_m")
 _POINTS = Axis("sampled points", "data.observation.num_points")
 
-_DETECTOR = (_MPJPE_EQ38, PCKH)
-_MESH = (APVE, _MPJPE_EQ38)
+_DETECTOR = (_MPJPE_EQ38, _PCKH)
+_MESH = (_APVE, _MPJPE_EQ38)
 _DETECTOR_NOISE = (_MAX_PX, _MEAN_PX, *_DETECTOR)
 _MESH_NOISE = (_MAX_MM, _MEAN_MM, *_MESH)
 
@@ -281,7 +281,7 @@ _ALL = (
     Table(
         "demo",
         "Yardsticks and detectors",
-        (MPJPE, PCKH),
+        (_MPJPE, _PCKH),
         (
             Row("initial joints", None, metrics=_NO_PCKH),
             Row("mean offset", "detector/mean_offset"),

@@ -3,8 +3,9 @@
 import csv
 import io
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from ljn.report.ordering import Comparison, verdict
 from ljn.report.results import Cell, Results, RowResult, TableResult
@@ -27,25 +28,9 @@ def number(value: float | None, is_signed: bool = False) -> str:
     return f"{value:+.1f}" if is_signed else f"{value:.1f}"
 
 
-def ours(row: RowResult, cell: Cell) -> str:
-    """Our value with its standard deviation over seeds; `failed` or `missing` where there is none, never nothing."""
-    if cell.metric is None:
-        return NONE
-    if cell.mean is None:
-        return "FAILED" if row.is_failed else "missing"
-    value = number(cell.mean) if cell.sd is None else f"{number(cell.mean)} ± {number(cell.sd)}"
-    return f"{value} †" if cell.is_substituted else value
-
-
 def headings(column: Column, has_thesis: bool) -> list[str]:
     """What is shown below a column: a difference only of results."""
     return ["thesis", "ours", *["difference"] * bool(column.goal)] if has_thesis else ["ours"]
-
-
-def seeds(row: RowResult) -> str:
-    """How many seeds its numbers come from; and its status, where that is not `complete`."""
-    count = max((cell.num_seeds for cell in row.cells), default=0)
-    return str(count) if row.status == "complete" else f"{count} ({row.status})"
 
 
 def lead_unit(comparison: Comparison) -> str:
@@ -79,8 +64,8 @@ def describe_order(table: TableResult) -> str:
     parts = []
     for column, num_claims in zip(table.table.columns, table.num_claims):
         if column.goal is not None:
-            own = [comparison for comparison in table.comparisons if comparison.column is column]
-            parts.append(f"{column.label} {verdict(own, num_claims)[1]}")
+            of_column = [comparison for comparison in table.comparisons if comparison.column is column]
+            parts.append(f"{column.label} {verdict(of_column, num_claims)[1]}")
     return "The thesis's ordering: " + "; ".join(parts) + "."
 
 
@@ -92,86 +77,117 @@ def describe_job(run: Run) -> str:
 
 def notes(results: Results, table: TableResult) -> list[str]:
     """A table's footnotes."""
-    found = list(table.table.notes)
-    sources = sorted(
-        {str(run.data["source"]) for row in table.rows for run in row.runs if run.data.get("source")}
-    )
+    lines = list(table.table.notes)
+    sources = sources_of(run for row in table.rows for run in row.runs)
     if any(table.has_thesis) and (results.sweep.preset != "thesis" or sources != ["surreal"]):
-        found.append(
+        lines.append(
             f"Ours: preset {results.sweep.preset}, data source {' and '.join(sources) or 'missing'}. The thesis: "
             "60,000 training samples of SURREAL. Compare the order of the rows rather than their values."
         )
-    return found
+    return lines
+
+
+def sources_of(runs: Iterable[Run]) -> list[str]:
+    """The names of the data sources of runs."""
+    return sorted({str(run.data["source"]) for run in runs if run.data.get("source")})
+
+
+class Entry(NamedTuple):
+    """A cell of a table as text.
+
+    Attributes:
+        text: What it says; never nothing.
+        style: Its class on the page: `thesis`, `ours`, `none` (a dash) or `word`; none of these for another number.
+    """
+
+    text: str
+    style: str = ""
 
 
 @dataclass(frozen=True)
 class Sheet:
-    """A table's cells as text: what the plain, Markdown and LaTeX tables have in common.
+    """A table's cells as text: what the plain, Markdown, LaTeX and HTML tables have in common.
 
     Attributes:
         groups: A heading and how many columns it spans, for each of the table's columns.
         columns: Second headings, one a column.
-        rows: Texts, the row's label first.
-        num_own: How many of the rows are ours; literature follows.
+        rows: Cells, the row's label first; literature follows our own rows.
     """
 
     groups: list[tuple[str, int]]
     columns: list[str]
-    rows: list[list[str]]
-    num_own: int
+    rows: list[list[Entry]]
+
+    @property
+    def texts(self) -> list[list[str]]:
+        """The rows as text alone."""
+        return [[entry.text for entry in row] for row in self.rows]
 
 
 def sheet(table: TableResult) -> Sheet:
     """A table as text."""
-    groups: list[tuple[str, int]] = [("", 1)]
-    columns = [""]
-    for column, has_thesis in zip(table.table.columns, table.has_thesis):
-        names = headings(column, has_thesis)
-        groups.append((column.heading, len(names)))
-        columns += names
-    groups.append(("", 1))
-    columns.append("seeds")
+    names = [
+        headings(column, has_thesis) for column, has_thesis in zip(table.table.columns, table.has_thesis)
+    ]
+    groups = [(column.heading, len(below)) for column, below in zip(table.table.columns, names)]
+    none = Entry(NONE, "none")
     rows = []
     for row in table.rows:
-        texts = [row.label]
-        for cell, has_thesis in zip(row.cells, table.has_thesis):
-            value = ours(row, cell)
-            entries = {
-                "thesis": number(cell.thesis),
-                "ours": value,
-                "difference": number(cell.difference, True),
+        entries = [Entry(row.label)]
+        for cell, below in zip(row.cells, names):
+            texts = {
+                "thesis": Entry(number(cell.thesis), "thesis"),
+                "ours": _ours(row, cell),
+                "difference": Entry(number(cell.difference, is_signed=True)),
             }
-            texts += [entries[name] for name in headings(cell.column, has_thesis)]
-        rows.append([*texts, seeds(row) if any(cell.metric for cell in row.cells) else NONE])
-    for entry in table.table.literature:
-        texts = [f"{entry.label} ({entry.source})"]
-        for column, has_thesis in zip(table.table.columns, table.has_thesis):
-            value = number(entry.values.get(column.metric))
-            texts += [value if name == "thesis" else NONE for name in headings(column, has_thesis)]
-        rows.append([*texts, NONE])
-    return Sheet(groups, columns, rows, len(table.rows))
+            entries += [texts[name] for name in below]
+        rows.append([*entries, _seeds(row) if any(cell.metric for cell in row.cells) else none])
+    for literature in table.table.literature:
+        entries = [Entry(f"{literature.label} ({literature.source})")]
+        for column, below in zip(table.table.columns, names):
+            value = Entry(number(literature.values.get(column.metric)), "thesis")
+            entries += [value if name == "thesis" else none for name in below]
+        rows.append([*entries, none])
+    columns = [name for below in names for name in below]
+    return Sheet([("", 1), *groups, ("", 1)], ["", *columns, "seeds"], rows)
+
+
+def _ours(row: RowResult, cell: Cell) -> Entry:
+    """Our value with its standard deviation over seeds; `failed` or `missing` where there is none, never nothing."""
+    if cell.metric is None:
+        return Entry(NONE, "none")
+    if cell.mean is None:
+        return Entry("FAILED" if row.is_failed else "missing", "word")
+    value = number(cell.mean) if cell.sd is None else f"{number(cell.mean)} ± {number(cell.sd)}"
+    return Entry(f"{value} †" if cell.is_substituted else value, "ours")
+
+
+def _seeds(row: RowResult) -> Entry:
+    """How many seeds its numbers come from; and its status, where that is not `complete`."""
+    count = max((cell.num_seeds for cell in row.cells), default=0)
+    return Entry(str(count)) if row.status == "complete" else Entry(f"{count} ({row.status})", "word")
 
 
 def to_text(results: Results) -> str:
     """Plain tables for the terminal, the failed runs by name below them."""
     parts = [_text_table(results, table) for table in results.tables]
-    parts.append("\n".join(describe_job(run) for run in (*results.failed, *results.missing)))
+    parts.append("\n".join(map(describe_job, results.lost)))
     return "\n\n".join(part for part in parts if part) + "\n"
 
 
 def _text_table(results: Results, table: TableResult) -> str:
     page = sheet(table)
     widths = [
-        max(len(line[index]) for line in [page.columns, *page.rows]) for index in range(len(page.columns))
+        max(len(line[index]) for line in [page.columns, *page.texts]) for index in range(len(page.columns))
     ]
     start = 0
     heading = []
     for name, span in page.groups:
-        own = slice(start, start + span)
+        below = slice(start, start + span)
         # A heading wider than its columns widens the last of them.
-        missing = len(name) - (sum(widths[own]) + 2 * (span - 1))
+        missing = len(name) - (sum(widths[below]) + 2 * (span - 1))
         widths[start + span - 1] += max(missing, 0)
-        heading.append(name.rjust(sum(widths[own]) + 2 * (span - 1)))
+        heading.append(name.rjust(sum(widths[below]) + 2 * (span - 1)))
         start += span
 
     def line(texts: Sequence[str]) -> str:
@@ -181,15 +197,14 @@ def _text_table(results: Results, table: TableResult) -> str:
         ]
         return "  ".join(cells).rstrip()
 
-    body = [line(row) for row in page.rows]
+    order = describe_order(table)
     return "\n".join(
         [
             f"{table.table.title} (preset {results.sweep.preset})",
             "  ".join(heading).rstrip(),
-            line(page.columns),
-            *body,
+            *map(line, [page.columns, *page.texts]),
+            *([order] if order else []),
         ]
-        + [text for text in (describe_order(table),) if text]
     )
 
 
@@ -232,27 +247,18 @@ def to_markdown(results: Results) -> str:
     parts = [f"# {_markdown(results.sweep.name)}"]
     for table in results.tables:
         page = sheet(table)
-        names = [
-            f"{group}: {column}" if group else column
-            for (group, column) in zip(
-                [name for name, span in page.groups for _ in range(span)], page.columns
-            )
-        ]
-        lines = [names, ["---"] + ["---:"] * (len(names) - 1), *page.rows]
-        is_rule = [False, True] + [False] * len(page.rows)
+        groups = [name for name, span in page.groups for _ in range(span)]
+        names = [f"{group}: {column}" if group else column for group, column in zip(groups, page.columns)]
+        lines = [[_markdown(text) for text in texts] for texts in (names, *page.texts)]
+        lines.insert(1, ["---"] + ["---:"] * (len(names) - 1))
         parts += [
             f"## {_markdown(table.table.title)}",
-            "\n".join(
-                "| " + " | ".join(texts if rule else map(_markdown, texts)) + " |"
-                for texts, rule in zip(lines, is_rule)
-            ),
+            "\n".join(f"| {' | '.join(texts)} |" for texts in lines),
             _markdown(describe_order(table)),
             "\n".join(f"- {_markdown(describe_comparison(entry))}" for entry in table.comparisons),
             "\n".join(_markdown(note) + "  " for note in notes(results, table)).rstrip(),
         ]
-    parts.append(
-        "\n".join(f"- {_markdown(describe_job(run))}" for run in (*results.failed, *results.missing))
-    )
+    parts.append("\n".join(f"- {_markdown(describe_job(run))}" for run in results.lost))
     return "\n\n".join(part for part in parts if part) + "\n"
 
 
@@ -273,9 +279,9 @@ def _latex_table(results: Results, table: TableResult) -> str:
     def line(texts: Sequence[str], escape: Callable[[str], str] = latex) -> str:
         return "    " + " & ".join(map(escape, texts)) + r" \\"
 
-    body = [line(row) for row in page.rows]
-    if page.num_own < len(body):
-        body.insert(page.num_own, r"    \midrule")
+    body = [line(texts) for texts in page.texts]
+    if len(table.rows) < len(body):
+        body.insert(len(table.rows), r"    \midrule")
     failed = [describe_job(run) for row in table.rows for run in row.runs if run.status != "complete"]
     remarks = [text for text in (describe_order(table), *notes(results, table), *failed) if text]
     return "\n".join(

@@ -7,6 +7,12 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from ljn.runs import layout
+
+_MAX_BYTES = 2**24
+_MAX_DEPTH = 32
+_MAX_METRIC = 1e100
+
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
     """Write a JSON file, whole or not at all. NaN and infinity are written as null."""
@@ -16,12 +22,49 @@ def write_json(path: Path, content: Mapping[str, Any]) -> None:
 
 
 def read_json(path: Path) -> dict[str, Any] | None:
-    """The content of a JSON file; None where there is none, or a damaged one."""
+    """The content of a JSON file, NaN and infinity as None.
+
+    Returns:
+        None where there is no file, or a damaged one: no object, larger or deeper than any that is written here, or
+        with text that cannot be written again.
+    """
     try:
-        content = json.loads(path.read_text())
-    except (OSError, ValueError):
+        with path.open("rb") as file:
+            data = file.read(_MAX_BYTES + 1)
+        if len(data) > _MAX_BYTES:
+            return None
+        content = json.loads(data.decode())
+        _check(content)
+    except (OSError, ValueError, RecursionError):
         return None
-    return content if isinstance(content, dict) else None
+    return _finite(content) if isinstance(content, dict) else None
+
+
+def read_metrics(directory: Path) -> dict[str, float] | None:
+    """A run's metrics by name, NaN where one was not finite; None where there are none, or a damaged file."""
+    content = read_json(directory / layout.METRICS)
+    if content is None or any(
+        isinstance(value, bool) or not isinstance(value, int | float | None) for value in content.values()
+    ):
+        return None
+    # What no network predicts would overflow in a mean.
+    return {
+        name: math.nan if value is None or abs(value) > _MAX_METRIC else float(value)
+        for name, value in content.items()
+    }
+
+
+def _check(value: Any, depth: int = 0) -> None:
+    """Raise a `ValueError` for plain values that are nested too deeply, or text with half a surrogate pair."""
+    if depth > _MAX_DEPTH:
+        raise ValueError("nested too deeply")
+    if isinstance(value, str):
+        value.encode()
+    elif isinstance(value, dict):
+        _check([*value, *value.values()], depth)
+    elif isinstance(value, list):
+        for entry in value:
+            _check(entry, depth + 1)
 
 
 def _finite(value: Any) -> Any:

@@ -14,7 +14,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from ljn.runs.files import read_json, write_json
+from ljn.runs import layout
+from ljn.runs.files import read_json, read_metrics, write_json
 from ljn.runs.processes import is_first_process
 
 RECORD_VERSION = 1
@@ -37,9 +38,10 @@ class RunRecord:
         self.directory = directory
         self._writes = is_first_process()
         self._facts = dict(facts)
-        before = read_json(directory / "record.json") or {}
-        self._wall_time_before = float(before.get("wall_time_s") or 0.0)
-        self._attempts = int(before.get("attempts") or 0) + 1
+        before = read_json(directory / layout.RECORD) or {}
+        seconds, attempts = before.get("wall_time_s"), before.get("attempts")
+        self._wall_time_before = seconds if isinstance(seconds, float) else 0.0
+        self._attempts = (attempts if isinstance(attempts, int) else 0) + 1
 
     def __enter__(self) -> Self:
         self.directory.mkdir(parents=True, exist_ok=True)
@@ -78,7 +80,7 @@ class RunRecord:
             return
         elapsed = time.monotonic() - self._started
         self._facts["wall_time_s"] = round(self._wall_time_before + elapsed, 1)
-        write_json(self.directory / "record.json", self._facts)
+        write_json(self.directory / layout.RECORD, self._facts)
 
 
 @contextmanager
@@ -105,11 +107,11 @@ def alone_in(directory: Path) -> Iterator[None]:
 
 def is_complete(directory: Path, identity_hash: str) -> bool:
     """Whether a run of that identity has finished in a directory."""
-    record = read_json(directory / "record.json") or {}
+    record = read_json(directory / layout.RECORD) or {}
     return (
         record.get("status") == "complete"
         and record.get("config_hash") == identity_hash
-        and read_json(directory / "metrics.json") is not None
+        and read_metrics(directory) is not None
     )
 
 

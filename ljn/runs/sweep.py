@@ -12,7 +12,8 @@ import numpy as np
 import yaml
 
 from ljn.reading import READ_ERRORS
-from ljn.runs.files import read_json
+from ljn.runs import layout
+from ljn.runs.files import read_json, read_metrics
 from ljn.runs.keys import key_of, kind_of
 
 Status = Literal["complete", "failed", "missing"]
@@ -68,37 +69,53 @@ class Run:
     @property
     def data(self) -> Mapping[str, Any]:
         """What the record says of the data."""
-        return _mapping(self.record.get("data"))
+        return mapping(self.record.get("data"))
+
+    @property
+    def stage(self) -> str | None:
+        """What its stage is called; None where the record does not say."""
+        stage = self.record.get("stage")
+        return stage if isinstance(stage, str) else None
+
+    @property
+    def headline(self) -> dict[str, Mapping[str, Any]]:
+        """`unit` and `goal` of the metrics that a table of results shows; nothing where the record does not say."""
+        metrics = mapping(self.record.get("metrics"))
+        keys = (str(key) for key in _list(self.record.get("headline")))
+        return {key: mapping(metrics.get(key)) for key in keys}
+
+    @property
+    def is_root_relative(self) -> bool:
+        """Whether only its joints' positions beside the root mean something, as the record says."""
+        return self.record.get("is_root_relative") is True
 
     @property
     def picture(self) -> Path | None:
         """The page of its best, median and worst test samples."""
-        path = None if self.directory is None else self.directory / "pictures" / "test_best_median_worst.png"
-        return path if path is not None and path.is_file() else None
+        path = self.directory and self.directory / layout.PICTURES / layout.EXTREMES
+        return path if path and path.is_file() else None
 
     @cached_property
     def config(self) -> Mapping[str, Any]:
         """Its resolved configuration, or nothing."""
+        if self.directory is None:
+            return {}
         try:
-            assert self.directory is not None
-            return _mapping(yaml.safe_load((self.directory / "config.yaml").read_text()))
-        except (AssertionError, OSError, ValueError, yaml.YAMLError):
+            return mapping(yaml.safe_load((self.directory / layout.CONFIG).read_text()))
+        except (*READ_ERRORS, yaml.YAMLError):
             return {}
 
     def setting(self, key: str) -> float | None:
         """A number of its configuration, such as `data.observation.num_points`; None where there is none."""
         value: Any = self.config
         for part in key.split("."):
-            value = _mapping(value).get(part)
+            value = mapping(value).get(part)
         return float(value) if isinstance(value, int | float) else None
 
     @cached_property
     def _csv_rows(self) -> list[dict[str, str]]:
-        folder = None if self.directory is None else self.directory / "csv"
-        if folder is None or not folder.is_dir():
-            return []
         rows: list[dict[str, str]] = []
-        for path in sorted(folder.glob("version_*/metrics.csv"), key=_version):
+        for path in sorted(self.directory.glob(layout.CURVES), key=_version) if self.directory else ():
             try:
                 with path.open(newline="") as file:
                     rows += list(csv.DictReader(file))
@@ -115,37 +132,37 @@ class Run:
         trained: set[int] = set()
         values: dict[int, float] = {}
         for row in self._csv_rows:
-            epoch, value = _number(row.get("epoch")), _number(row.get(f"val/{metric}"))
+            epoch, value = number_of(row.get("epoch")), number_of(row.get(f"val/{metric}"))
             if epoch is None:
                 continue
-            if _number(row.get("train/loss")) is not None:
+            if number_of(row.get("train/loss")) is not None:
                 trained.add(int(epoch))
             if value is not None:
                 values[int(epoch)] = value
         # The best checkpoint's validation after the training is logged as one more epoch.
         return {epoch + 1: values[epoch] for epoch in sorted(values) if epoch in trained}
 
-    def sample_errors(self, metric: str) -> tuple[np.ndarray, np.ndarray] | None:
-        """The errors of its test samples.
+    def sample_values(self, metric: str) -> tuple[np.ndarray, np.ndarray] | None:
+        """A metric's values of its test samples.
 
         Args:
-            metric: Of which metric.
+            metric: Its key.
 
         Returns:
-            The samples `(S, 73)`, each its number and its true joints (metres, camera frame), by which samples of
-            two runs can be told to be the same, and their errors `(S,)`, mm; None where there are none, or none of
-            that metric.
+            The samples `(S, T)`, each its number and what is true of it, by which samples of two runs can be told to be
+            the same, and their values `(S,)`; None where they are not known.
         """
-        if self.directory is None:
+        truth = _list(self.record.get("truth"))
+        if self.directory is None or not truth:
             return None
         try:
-            with np.load(self.directory / "test_errors.npz") as arrays:
-                errors = _errors(arrays, metric)
-                ids, joints = arrays["sample_id"], arrays["joints"]
-                samples = np.column_stack([ids, joints.reshape(len(ids), -1)])
-                return None if errors is None else (samples, errors)
+            with np.load(self.directory / layout.SAMPLES) as arrays:
+                ids, values = arrays["sample_id"], arrays[metric].astype(np.float64)
+                parts = [arrays[name].reshape(len(ids), -1) for name in truth]
+                samples = np.column_stack([ids, *parts]).astype(np.float64)
         except READ_ERRORS:
             return None
+        return (samples, values) if values.shape == (len(samples),) else None
 
 
 @dataclass(frozen=True)
@@ -177,10 +194,10 @@ def read_sweep(directory: Path) -> Sweep:
         FileNotFoundError: It does not.
         ValueError: That file is damaged.
     """
-    path = directory / "sweep.json"
+    path = directory / layout.SWEEP
     if not path.is_file():
         raise FileNotFoundError(
-            f"directory: expected a sweep's directory with a sweep.json, got '{directory}'"
+            f"directory: expected a sweep's directory with a {layout.SWEEP}, got '{directory}'"
         )
     content = read_json(path)
     if content is None or not isinstance(content.get("jobs"), list):
@@ -189,75 +206,71 @@ def read_sweep(directory: Path) -> Sweep:
         )
     preset = str(content.get("preset") or "missing")
     runs: dict[Any, Run] = {}
-    for job in content["jobs"]:
-        run = _read_run(_mapping(job), directory, preset)
+    for job in read_jobs(directory):
+        run = _read_run(job, directory, preset)
         runs.setdefault((run.experiment, run.overrides, run.seed), run)
     return Sweep(
         name=str(content.get("name") or directory.name),
         preset=preset,
-        tables=tuple(str(name) for name in content.get("tables") or ()),
+        tables=tuple(map(str, _list(content.get("tables")))),
         command=str(content.get("command") or "missing"),
         runs=tuple(runs.values()),
     )
 
 
+def read_jobs(directory: Path) -> list[dict[str, Any]]:
+    """The jobs of a sweep's `sweep.json`; none where it is missing or damaged."""
+    return [job_of(job) for job in _list((read_json(directory / layout.SWEEP) or {}).get("jobs"))]
+
+
+def job_of(content: Any) -> dict[str, Any]:
+    """A job as `sweep.json` has it, read: what is of another type than it should be is None, or no override."""
+    job = mapping(content)
+    texts = {
+        key: job[key] if isinstance(job.get(key), str) else None
+        for key in ("experiment", "run_dir", "status", "error")
+    }
+    seed = job.get("seed")
+    overrides = [str(override) for override in _list(job.get("overrides"))]
+    return texts | {"overrides": overrides, "seed": seed if isinstance(seed, int) else None}
+
+
 def _read_run(job: Mapping[str, Any], sweep: Path, preset: str) -> Run:
-    directory = _locate(job.get("run_dir"), sweep)
-    record = read_json(directory / "record.json") if directory else None
-    metrics = _test_metrics(read_json(directory / "metrics.json") if directory else None)
-    error = job.get("error") or (record or {}).get("error")
+    directory = _locate(job["run_dir"], sweep)
+    record = (read_json(directory / layout.RECORD) if directory else None) or {}
+    prefix = "test/"
+    metrics = {
+        key.removeprefix(prefix): value
+        for key, value in ((read_metrics(directory) if directory else None) or {}).items()
+        if key.startswith(prefix)
+    }
+    error = job["error"] or record.get("error")
     status: Status = "complete"
-    if job.get("status") == "failed" or (not metrics and (record or {}).get("status") == "failed"):
+    if job["status"] == "failed" or (not metrics and record.get("status") == "failed"):
         status, metrics = "failed", {}
     elif not metrics:
         status = "missing"
-    overrides = (str(override) for override in job.get("overrides") or ())
     return Run(
-        experiment=None if job.get("experiment") is None else str(job["experiment"]),
-        overrides=settings(overrides, preset),
-        seed=job["seed"] if isinstance(job.get("seed"), int) else None,
+        experiment=job["experiment"],
+        overrides=settings(job["overrides"], preset),
+        seed=job["seed"],
         directory=directory,
         status=status,
         error=None if status == "complete" or error is None else str(error),
         metrics=metrics,
-        record=record or {},
+        record=record,
     )
 
 
-def _locate(run_dir: Any, sweep: Path) -> Path | None:
+def _locate(run_dir: str | None, sweep: Path) -> Path | None:
     """A run's directory. A relative one is below the sweep's, or below one of the folders that hold that."""
-    if not isinstance(run_dir, str) or not run_dir:
+    if not run_dir:
         return None
     places = [base / run_dir for base in (sweep, *sweep.absolute().parents)]  # an absolute one stays as it is
-    return next((place for place in places if place.is_dir()), places[0])
-
-
-def _test_metrics(content: Mapping[str, Any] | None) -> dict[str, float]:
-    prefix = "test/"
-    return {
-        key.removeprefix(prefix): math.nan if value is None else float(value)
-        for key, value in (content or {}).items()
-        if key.startswith(prefix) and (value is None or isinstance(value, int | float))
-    }
-
-
-def _errors(arrays: Mapping[str, np.ndarray], metric: str) -> np.ndarray | None:
-    """Errors `(S,)`, mm, of the metrics that are means over samples."""
-    from ljn.body.skeleton import ROOT
-
-    if metric == "apve":
-        return arrays["apve_mm"]
-    if metric == "mpjpe":
-        return arrays["errors_mm"].mean(1)
-    if metric == "initial_mpjpe":
-        return arrays["initial_errors_mm"].mean(1)
-    if metric == "mpjpe_eq38":
-        errors = arrays["errors_mm"]
-        return (errors.sum(1) - errors[:, ROOT]) / errors.shape[1]
-    if metric == "mpjpe_root_aligned":
-        pred, target = (arrays[name] - arrays[name][:, [ROOT]] for name in ("pred_joints", "joints"))
-        return 1000 * np.linalg.norm(pred - target, axis=-1).mean(1)
-    return None
+    try:
+        return next((place for place in places if place.is_dir()), places[0])
+    except OSError:  # a name that the file system does not take
+        return None
 
 
 def _version(path: Path) -> int:
@@ -265,15 +278,22 @@ def _version(path: Path) -> int:
     return int(digits) if digits.isdigit() else -1
 
 
-def _number(text: str | None) -> float | None:
+def number_of(text: str | None) -> float | None:
+    """The finite number that a text is; None for any other text."""
     try:
-        return float(text) if text else None
+        value = float(text or "nan")
     except ValueError:
         return None
+    return value if math.isfinite(value) else None
 
 
-def _mapping(value: Any) -> Mapping[str, Any]:
+def mapping(value: Any) -> Mapping[str, Any]:
+    """A mapping as it is; nothing for anything else."""
     return value if isinstance(value, Mapping) else {}
+
+
+def _list(value: Any) -> list[Any]:
+    return value if isinstance(value, list) else []
 
 
 def varying(settings: Iterable[tuple[str, ...]]) -> frozenset[str]:

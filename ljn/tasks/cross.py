@@ -7,6 +7,7 @@ from hydra import compose
 from omegaconf import DictConfig, OmegaConf, open_dict
 
 from ljn.building import build
+from ljn.runs import layout
 from ljn.runs.keys import key_of, kind_of
 from ljn.tasks.arguments import quoted
 from ljn.tasks.evaluate import evaluate_checkpoint
@@ -73,7 +74,7 @@ def _trained(cfg: DictConfig, name: str) -> Path:
         cfg.name = name
         cfg.rerun = False  # that of the evaluation is meant
     train(cfg)
-    return Path(cfg.paths.run_dir) / "checkpoints" / "best.ckpt"
+    return Path(cfg.paths.run_dir) / layout.BEST_CHECKPOINT
 
 
 def _composed(experiment: str) -> DictConfig:

@@ -8,8 +8,9 @@ from omegaconf import DictConfig
 
 from ljn.building import build
 from ljn.data import BodyDataModule
+from ljn.runs import layout
 from ljn.runs.checkpoints import Checkpoint, load_state, read_checkpoint
-from ljn.runs.files import read_json, write_json
+from ljn.runs.files import read_metrics, write_json
 from ljn.runs.identity import config_hash, identity
 from ljn.runs.record import RunRecord, alone_in, is_complete
 from ljn.tasks.overrides import check_bodies, typed_overrides, with_checkpoint_config
@@ -67,7 +68,7 @@ def evaluate_checkpoint(
     with alone_in(run_dir):
         if reuses and not call.rerun and is_complete(run_dir, identity_hash):
             _LOG.info("%s is complete; evaluate it again with rerun=true", run_dir)
-            return read_json(run_dir / "metrics.json") or {}
+            return read_metrics(run_dir) or {}
         return _evaluate(cfg, datamodule, checkpoint, run_dir, identity_hash)
 
 
@@ -86,6 +87,7 @@ def _evaluate(
         "trained_by": checkpoint.run,
         "checkpoint": {"path": str(checkpoint.path), "hash": checkpoint.file_hash, "epoch": checkpoint.epoch},
         "data": datamodule.describe(("test",)),
+        **module.describe(),
         "predicted_body": "-".join(module.body_hashes) or None,
     }
     with RunRecord(run_dir, facts) as record:
@@ -96,6 +98,6 @@ def _evaluate(
             trainer.test(module, datamodule, verbose=False)
             metrics = finite_metrics(trainer)
         if trainer.is_global_zero:
-            write_json(run_dir / "metrics.json", metrics)
+            write_json(run_dir / layout.METRICS, metrics)
     _LOG.info("%s on %s: %s", checkpoint.run, cfg.name, run_dir)
     return metrics

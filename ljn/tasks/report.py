@@ -6,6 +6,7 @@ from pathlib import Path
 from omegaconf import DictConfig
 
 from ljn.report import write_report
+from ljn.runs import layout
 
 _LOG = logging.getLogger(__name__)
 
@@ -25,11 +26,11 @@ def report(cfg: DictConfig) -> dict[str, float]:
     """
     sweeps = Path(cfg.paths.output_dir) / "sweeps"
     if cfg.task.directory is not None:
-        index = Path(cfg.task.directory) / "sweep.json"
+        index = Path(cfg.task.directory) / layout.SWEEP
     else:
-        index = max(sweeps.glob("*/sweep.json"), key=lambda path: path.stat().st_mtime, default=sweeps)
+        index = max(sweeps.glob(f"*/{layout.SWEEP}"), key=lambda path: path.stat().st_mtime, default=sweeps)
     if not index.is_file():
-        known = ", ".join(sorted(path.parent.name for path in sweeps.glob("*/sweep.json"))) or "none"
+        known = ", ".join(sorted(path.parent.name for path in sweeps.glob(f"*/{layout.SWEEP}"))) or "none"
         raise FileNotFoundError(
             f"task.directory: no sweep in '{index.parent if cfg.task.directory else sweeps}' (known: {known}); run "
             "one, python run.py sweep=table_3_2, or name its directory with task.directory=DIRECTORY"

@@ -14,6 +14,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from ljn.building import build, build_each
 from ljn.data import BodyDataModule
 from ljn.modules.base import StageModule
+from ljn.runs import layout
 from ljn.runs.checkpoints import AtomicCheckpointIO, Provenance
 from ljn.tasks.processes import is_first_process, num_processes, own_devices
 
@@ -95,5 +96,5 @@ def save_config(cfg: DictConfig, run_dir: Path) -> dict[str, Any]:
     """Write `config.yaml`, resolved, in the first process; returns the same as plain values."""
     config: dict[str, Any] = OmegaConf.to_container(cfg, resolve=True)  # type: ignore[assignment]
     if is_first_process():
-        (run_dir / "config.yaml").write_text(OmegaConf.to_yaml(OmegaConf.create(config)))
+        (run_dir / layout.CONFIG).write_text(OmegaConf.to_yaml(OmegaConf.create(config)))
     return config

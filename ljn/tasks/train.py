@@ -8,8 +8,9 @@ from omegaconf import DictConfig
 
 from ljn.building import build
 from ljn.data import BodyDataModule
+from ljn.runs import layout
 from ljn.runs.checkpoints import read_checkpoint
-from ljn.runs.files import read_json, write_json
+from ljn.runs.files import read_metrics, write_json
 from ljn.runs.identity import config_hash, identity
 from ljn.runs.record import RunRecord, alone_in, is_complete
 from ljn.tasks.processes import check_trains_in_processes, is_first_process, num_processes
@@ -46,7 +47,7 @@ def train(cfg: DictConfig) -> dict[str, float]:
     with alone_in(run_dir):
         if is_complete(run_dir, identity_hash) and not cfg.rerun:
             _LOG.info("%s is complete; train it again with rerun=true", run_dir)
-            return read_json(run_dir / "metrics.json") or {}
+            return read_metrics(run_dir) or {}
         return _train(cfg, datamodule, run_dir, identity_hash)
 
 
@@ -57,7 +58,7 @@ def _train(
     module = build(cfg.module)
     datamodule.takes = module.takes
     check_trains_in_processes(module, num_processes(cfg.trainer))
-    last, best = (run_dir / "checkpoints" / f"{name}.ckpt" for name in ("last", "best"))
+    last, best = run_dir / layout.LAST_CHECKPOINT, run_dir / layout.BEST_CHECKPOINT
     if cfg.rerun and is_first_process():
         last.unlink(missing_ok=True)
     resumes = last.is_file()
@@ -68,6 +69,7 @@ def _train(
         "preset": cfg.preset.name,
         "config_hash": identity_hash,
         "data": datamodule.describe(),
+        **module.describe(),
         "predicted_body": "-".join(module.body_hashes) or None,
         "num_parameters": sum(parameter.numel() for parameter in module.parameters()),
     }
@@ -95,5 +97,5 @@ def _train(
             trainer.test(module, datamodule, ckpt_path=best, verbose=False, weights_only=True)
             metrics |= finite_metrics(trainer)
         if trainer.is_global_zero:
-            write_json(run_dir / "metrics.json", metrics)
+            write_json(run_dir / layout.METRICS, metrics)
     return metrics

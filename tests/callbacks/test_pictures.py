@@ -31,7 +31,7 @@ def draw_extremes(tmp_path):
         trainer = SimpleNamespace(
             is_global_zero=True, loggers=[], test_dataloaders=SimpleNamespace(dataset=dataset)
         )
-        module = SimpleNamespace(net=SimpleNamespace(is_root_relative=is_root_relative))
+        module = SimpleNamespace(is_root_relative=is_root_relative)
         batch = {"sample_id": torch.arange(3), "joints": joints}
         pictures = Drawn(tmp_path, num_samples=1)
         pictures.on_test_batch_end(trainer, module, {"pred_joints": pred_joints}, batch, 0)

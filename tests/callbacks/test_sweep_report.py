@@ -38,6 +38,14 @@ def test_a_later_call_keeps_what_earlier_ones_have_done(end_job):
     assert sorted(job["run_dir"] for job in jobs) == ["runs/a", "runs/b", "runs/c"]
 
 
+def test_a_damaged_index_of_earlier_jobs_stops_nothing(end_job, tmp_path):
+    end_job("first", 0, "a")
+    index = tmp_path / "sweeps" / "table_3_4-smoke" / "sweep.json"
+    for content in ("[", '{"jobs": 3}', '{"jobs": [3, {}, {"seed": [], "overrides": 1, "run_dir": {}}]}'):
+        index.write_text(content)
+        assert "runs/b" in [job["run_dir"] for job in end_job("second", 1, "b")]
+
+
 def test_a_seed_that_ran_again_takes_the_place_of_the_earlier_run(end_job):
     end_job("first", 0, "a")
     end_job("first", 1, "b")

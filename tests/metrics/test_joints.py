@@ -8,8 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
-import ljn.metrics as metrics_module
-from ljn.metrics import JointMetrics, MaxKeypointDistance, SampleMax, SampleMean, functional
+from ljn.metrics import JointMetrics, MeshMetrics, SampleMax, SampleMean, functional
 
 KEYS = {
     "mpjpe",
@@ -22,14 +21,6 @@ KEYS = {
     "initial_mpjpe",
     "initial_mean_distance_px",
     "initial_max_distance_px",
-}
-JOINT_METRICS = {
-    "MPJPE": functional.mpjpe,
-    "MPJPEEq38": functional.mpjpe_eq38,
-    "RootAlignedMPJPE": functional.mpjpe_root_aligned,
-    "ProcrustesMPJPE": functional.mpjpe_procrustes,
-    "PCKh": functional.pckh,
-    "RootAlignedPCKh": functional.pckh_root_aligned,
 }
 NUM_SAMPLES = 13
 
@@ -113,16 +104,30 @@ def test_reset_forgets_everything():
     assert values(updated(metrics, batch, [4])) == values(updated(JointMetrics(), batch, [4]))
 
 
-@pytest.mark.parametrize("name", JOINT_METRICS)
-def test_each_joint_metric_stands_alone(name):
-    metric = getattr(metrics_module, name)()
-    pred, joints = list(make_batch(NUM_SAMPLES).values())[:2]
-    metric.update(pred[:5], joints[:5])
-    metric.update(pred[5:], joints[5:])
-    expected = JOINT_METRICS[name](pred, joints)
-    torch.testing.assert_close(metric.compute(), expected.mean(), rtol=1e-12, atol=0)
-    metric.reset()
-    torch.testing.assert_close(metric(pred[:5], joints[:5]), expected[:5].mean(), rtol=1e-12, atol=0)
+def test_each_sample_s_values_come_back_and_give_the_metric_again():
+    batch, metrics = make_batch(NUM_SAMPLES), JointMetrics("test/")
+    samples = metrics.update(**batch)
+    assert samples.keys() == KEYS
+    distances = functional.keypoint_distances_px(batch["keypoints"], batch["true_keypoints"])
+    assert torch.equal(samples["initial_max_distance_px"], distances.amax(1))
+    assert torch.equal(samples["pckh"], functional.pckh(batch["pred_joints"], batch["joints"]))
+    for key, value in metrics.compute().items():
+        of_samples = samples[key.removeprefix("test/")]
+        assert (of_samples.shape, of_samples.dtype) == ((NUM_SAMPLES,), torch.float64)
+        whole = of_samples.max() if "max" in key else of_samples.mean()
+        torch.testing.assert_close(value, whole, rtol=1e-12, atol=0)
+
+
+@pytest.mark.parametrize("metrics", [JointMetrics, MeshMetrics])
+def test_a_record_has_unit_and_goal_of_each_metric(metrics):
+    facts = metrics.describe()
+    assert json.loads(json.dumps(facts)) == facts
+    assert facts["metrics"].keys() == metrics.table.keys() > set(facts["headline"])
+    assert all(facts["metrics"][key]["goal"] for key in facts["headline"])
+    assert facts["metrics"]["mpjpe"] == {"unit": "mm", "goal": "min"}
+    higher_is_better = {None: None, "min": False, "max": True}
+    for key, metric in metrics().items():
+        assert metric.higher_is_better is higher_is_better[facts["metrics"][key]["goal"]]
 
 
 @pytest.mark.filterwarnings("ignore:The ``compute`` method")
@@ -144,13 +149,10 @@ def test_one_nan_prediction_makes_every_score_of_the_prediction_nan():
     }
 
 
-def test_a_nan_keypoint_makes_the_maximum_nan():
-    metric = MaxKeypointDistance()
-    clean = torch.zeros(2, 24, 2)
-    noisy = clean.clone()
-    noisy[0, 0, 0] = torch.nan
-    metric.update(noisy[:1], clean[:1])
-    metric.update(noisy[1:], clean[1:])
+def test_a_nan_makes_the_maximum_nan():
+    metric = SampleMax("px")
+    metric.update(torch.tensor([torch.nan, 1.0]).double())
+    metric.update(torch.tensor([2.0]).double())
     assert metric.compute().isnan()
 
 

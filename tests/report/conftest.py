@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from ljn.metrics import JointMetrics, MeshMetrics
+
 
 class FakeSweep:
     """A sweep's directory, and runs in it as training leaves them."""
@@ -12,14 +14,15 @@ class FakeSweep:
         self.directory = directory
         self.jobs = []
 
-    def run(self, experiment, metrics, seed=0, overrides=(), errors=None, **changes):
-        """A finished run: test metrics without `test/`; `errors` `(S,)` mm, the same for each joint."""
+    def run(self, experiment, metrics, /, seed=0, overrides=(), errors=None, **changes):
+        """A finished run: test metrics without `test/`; `errors` `(S,)`, the samples' `mpjpe_eq38`, mm."""
         folder = self.directory / "runs" / f"run-{len(self.jobs)}"
         (folder / "csv" / "version_0").mkdir(parents=True)
         (folder / "pictures").mkdir()
         content = {f"test/{name}": value for name, value in metrics.items()}
         (folder / "metrics.json").write_text(json.dumps(content))
-        (folder / "record.json").write_text(json.dumps(RECORD | changes))
+        stage = MESH if "apve" in metrics else {}
+        (folder / "record.json").write_text(json.dumps(RECORD | stage | changes))
         (folder / "config.yaml").write_text("data:\n  num_points: 512\n")
         main = "apve" if "apve" in metrics else "mpjpe_eq38"
         lines = [f"epoch,step,train/loss,val/{main},val/mpjpe"]
@@ -30,10 +33,8 @@ class FakeSweep:
         picture = Image.new("RGB", (2000, 100), (200, 60, 60))
         picture.save(folder / "pictures" / "test_best_median_worst.png")
         if errors is not None:
-            # Eq. 3.8 leaves the root out.
-            joint_errors = np.repeat(np.asarray(errors)[:, None], 24, 1) * 24 / 23
             samples = {"sample_id": np.arange(len(errors)), "joints": np.zeros((len(errors), 24, 3))}
-            np.savez(folder / "test_errors.npz", **samples, errors_mm=joint_errors)
+            np.savez(folder / "test_errors.npz", **samples, mpjpe_eq38=errors)
         self.job(experiment, seed, overrides, run_dir=str(folder))
         return folder
 
@@ -50,7 +51,12 @@ class FakeSweep:
         return self.directory
 
 
+MESH = {"stage": "mesh", **MeshMetrics.describe()}
 RECORD = {
+    "stage": "detector",
+    **JointMetrics.describe(),
+    "truth": ["joints"],
+    "is_root_relative": False,
     "status": "complete",
     "preset": "small",
     "config_hash": "c0ffee12",

@@ -109,7 +109,16 @@ def test_samples_that_another_machine_made_are_the_same(sweep):
 
 
 @pytest.mark.parametrize(
-    "damage", ["fewer samples", "other samples", "no file", "no zip file", "a wrong byte", "another metric"]
+    "damage",
+    [
+        "fewer samples",
+        "other samples",
+        "no file",
+        "no zip file",
+        "a wrong byte",
+        "another metric",
+        "no row a sample",
+    ],
 )
 def test_without_the_errors_of_the_same_samples_there_is_no_interval(sweep, damage):
     errors = np.random.default_rng(1).uniform(20, 90, 30)
@@ -131,19 +140,26 @@ def test_without_the_errors_of_the_same_samples_there_is_no_interval(sweep, dama
     elif damage == "other samples":
         with np.load(path) as arrays:
             np.savez(path, **dict(arrays) | {"joints": arrays["joints"] + 0.1})
+    elif damage == "no row a sample":
+        with np.load(path) as arrays:
+            np.savez(path, **dict(arrays) | {"mpjpe_eq38": errors[:7]})
     elif damage == "another metric":
-        np.savez(path, sample_id=np.arange(30), joints=np.zeros((30, 24, 3)), apve_mm=errors)
+        np.savez(path, sample_id=np.arange(30), joints=np.zeros((30, 24, 3)), apve=errors)
     (entry,) = comparisons(sweep.write("table_3_2"))
     assert entry.interval is None
 
 
-def test_root_aligned_errors_are_made_of_the_joints(sweep):
-    sweep.run("detector/simple_baseline_0px", {"mpjpe_root_aligned": 90.0})
-    folder = sweep.directory / "runs" / "run-0"
-    joints = np.random.default_rng(2).normal(size=(5, 24, 3))
-    moved = joints + np.array([0.3, 0, 2.0])
-    moved[:, 5] += [0, 0, 0.024]
-    np.savez(folder / "test_errors.npz", sample_id=np.arange(5), joints=joints, pred_joints=moved)
-    run = read_results(sweep.write("table_3_2")).sweep.runs[0]
-    _, errors = run.sample_errors("mpjpe_root_aligned")
-    assert errors == pytest.approx(np.ones(5))
+def test_a_lead_of_what_should_be_high_has_its_interval_on_the_same_side(sweep):
+    shares = np.random.default_rng(1).uniform(20, 90, 30)
+    facts = {"headline": ["pckh"], "metrics": {"pckh": {"unit": "%", "goal": "max"}}}
+    for name, more in (("a", 5), ("b", 0)):
+        folder = sweep.run(name, {"pckh": shares.mean() + more}, errors=shares, **facts)
+        np.savez(
+            folder / "test_errors.npz",
+            sample_id=np.arange(30),
+            joints=np.zeros((30, 24, 3)),
+            pckh=shares + more,
+        )
+    (entry,) = comparisons(sweep.write())
+    assert (entry.better, entry.lead) == ("a", pytest.approx(5))
+    assert entry.interval == pytest.approx((5, 5))

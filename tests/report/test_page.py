@@ -3,7 +3,9 @@ import io
 import json
 import re
 import shutil
+import struct
 import subprocess
+import zlib
 from html.parser import HTMLParser
 
 import pytest
@@ -191,9 +193,30 @@ def test_pictures_are_embedded_once_a_row_small_and_with_words(html):
             assert opened.size == (1600, 80)
 
 
-def test_a_damaged_picture_is_left_out_with_a_warning(sweep):
+def huge_png():
+    """A picture that says it has 60,000 x 60,000 pixels."""
+    chunks = {
+        b"IHDR": struct.pack(">IIBBBBB", 60_000, 60_000, 8, 2, 0, 0, 0),
+        b"IDAT": zlib.compress(bytes(99)),
+    }
+    packed = (
+        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+        for kind, data in chunks.items()
+    )
+    return b"\x89PNG\r\n\x1a\n" + b"".join(packed)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [b"\x89PNG\r\n\x1a\n cut off", huge_png(), b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 9 9\n"],
+)
+def test_a_damaged_picture_is_left_out_with_a_warning(sweep, monkeypatch, content):
+    def start_ghostscript(*arguments, **options):
+        raise AssertionError("a picture started Ghostscript")
+
+    monkeypatch.setattr(subprocess, "Popen", start_ghostscript)
     folder = sweep.run("detector/basic", {"mpjpe_eq38": 60.0})
-    (folder / "pictures" / "test_best_median_worst.png").write_bytes(b"\x89PNG\r\n\x1a\n cut off")
+    (folder / "pictures" / "test_best_median_worst.png").write_bytes(content)
     with pytest.warns(UserWarning, match="is left out of the report"):
         write_report(sweep.write("table_3_2"))
     assert not Page((sweep.directory / "report.html").read_text()).all("img")

@@ -1,10 +1,12 @@
 import json
+import re
 import statistics
 import subprocess
 import sys
 
 import pytest
 
+from ljn.report import write_report
 from ljn.report.results import read_results
 from ljn.report.tables import ROOT_ALIGNED_NOTE
 from ljn.runs.sweep import read_sweep
@@ -62,14 +64,14 @@ def test_a_run_without_readable_test_metrics_is_missing(sweep, content):
     path.unlink() if content is None else path.write_text(content)
     results = read_results(sweep.write("table_3_2"))
     assert results.tables[0].rows[0].status == "missing"
-    assert len(results.missing) == 1
+    assert [run.status for run in results.lost] == ["missing"]
 
 
 def test_a_run_that_left_nothing_but_its_record_of_a_failure_is_failed(sweep):
     folder = sweep.run("detector/basic", {}, status="failed", error="OSError: disk full")
     (folder / "metrics.json").unlink()
-    (run,) = read_results(sweep.write("table_3_2")).failed
-    assert run.error == "OSError: disk full"
+    (run,) = read_results(sweep.write("table_3_2")).lost
+    assert (run.status, run.error) == ("failed", "OSError: disk full")
 
 
 def test_a_number_that_was_not_finite_is_no_result_to_be_proud_of(sweep):
@@ -117,7 +119,7 @@ PROPOSED = {"mpjpe": 60.0, "mpjpe_root_aligned": 55.0, "pckh": 50.0, "pckh_root_
 
 def test_a_grid_shows_the_simple_baseline_after_moving_the_roots_as_the_thesis_s_tables_do(sweep):
     for seed in (0, 1):
-        sweep.run("detector/simple_baseline", SIMPLE_BASELINE, seed)
+        sweep.run("detector/simple_baseline", SIMPLE_BASELINE, seed, is_root_relative=True)
         sweep.run("detector/proposed", PROPOSED, seed)
     (table,) = read_results(sweep.write()).tables
     assert [[cell.metric for cell in row.cells] for row in table.rows] == [
@@ -129,32 +131,13 @@ def test_a_grid_shows_the_simple_baseline_after_moving_the_roots_as_the_thesis_s
     assert [comparison.lead for comparison in table.comparisons] == [20.0, 20.0]
 
 
-@pytest.mark.parametrize(
-    ("target", "is_substituted"),
-    [
-        ("ljn.nets.simple_baseline.SimpleBaseline", True),
-        ("ljn.nets.joint_network.JointNetwork", False),
-        ("ljn.nets.simple_baseline.NoSuchNetwork", False),
-        ("ljn.nets.no_such_module.Network", False),
-        ("elsewhere.Network", False),
-        (None, False),
-    ],
-)
-def test_a_grid_knows_root_relative_detectors_by_their_networks(sweep, target, is_substituted):
-    folder = sweep.run(None, SIMPLE_BASELINE, overrides=("model=mine",))
-    (folder / "config.yaml").write_text(json.dumps({"model": {"_target_": target}}))
-    (table,) = read_results(sweep.write()).tables
-    assert [cell.is_substituted for cell in table.rows[0].cells] == [is_substituted] * 2
-    assert bool(table.table.notes) == is_substituted
-
-
 def test_a_grid_of_both_stages_has_a_table_for_each(sweep):
     sweep.run("mesh/basic", {"apve": 50.0, "mpjpe": 40.0})
     sweep.run("detector/basic", {"mpjpe": 90.0, "pckh": 40.0})
     sweep.run(None, {"apve": 45.0, "mpjpe": 35.0}, overrides=("model.a=1",))
     tables = read_results(sweep.write()).tables
     assert [table.table.name for table in tables] == ["sweep_detector", "sweep_mesh"]
-    assert [table.table.title for table in tables] == ["sweep: joint detectors", "sweep: mesh regressors"]
+    assert [table.table.title for table in tables] == ["sweep: detector", "sweep: mesh"]
     assert [[row.label for row in table.rows] for table in tables] == [
         ["detector/basic"],
         ["mesh/basic", "model.a=1"],
@@ -166,21 +149,35 @@ def test_a_grid_of_both_stages_has_a_table_for_each(sweep):
     assert all(cell.mean is not None for table in tables for row in table.rows for cell in row.cells)
 
 
-def test_runs_without_metrics_are_in_the_table_of_their_stage(sweep):
+def test_runs_without_a_record_are_with_other_seeds_of_theirs_or_else_in_the_first_table(sweep):
     sweep.run("mesh/basic", {"apve": 50.0, "mpjpe": 40.0})
-    sweep.run("mine", {"apve": 50.0, "mpjpe": 40.0})
-    for experiment in ("mesh/single", "mine", "detector/basic", None):
+    sweep.run("mine", {"mpjpe": 40.0})
+    for experiment in ("mesh/single", "mesh/basic", None):
         sweep.job(experiment, seed=1, status="failed")
-    first, second = read_results(sweep.write()).tables
-    assert [(row.row.experiment, row.status) for row in first.rows] == [
-        ("detector/basic", "failed"),
-        (None, "failed"),
+    rows = [
+        [(row.row.experiment, row.status) for row in table.rows]
+        for table in read_results(sweep.write()).tables
     ]
-    assert [(row.row.experiment, row.status) for row in second.rows] == [
-        ("mesh/basic", "complete"),
-        ("mine", "failed 1 of 2"),
-        ("mesh/single", "failed"),
+    assert rows == [
+        [("mine", "complete"), ("mesh/single", "failed"), (None, "failed")],
+        [("mesh/basic", "failed 1 of 2")],
     ]
+
+
+def test_metrics_of_runs_whose_records_say_nothing_of_them_are_all_shown(sweep):
+    sweep.run("old", {"mpjpe": 40.0, "pckh": 50.0}, stage=None, headline=None, metrics=None)
+    (table,) = read_results(sweep.write()).tables
+    assert [(column.heading, column.goal) for column in table.table.columns] == [
+        ("mpjpe", None),
+        ("pckh", None),
+    ]
+    assert [cell.mean for cell in table.rows[0].cells] == [40.0, 50.0]
+
+
+def test_a_grid_of_which_nothing_is_left_says_failed(sweep):
+    sweep.job("mine", status="failed")
+    report = write_report(sweep.write())
+    assert re.search(r"^mine +FAILED +0 \(failed\)$", report.text, re.MULTILINE)
 
 
 def test_runs_that_belong_to_no_table_are_shown_all_the_same(sweep):

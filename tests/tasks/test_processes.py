@@ -244,7 +244,7 @@ def test_two_processes_test_every_sample_once(on_one, on_two):
     with np.load(one / "test_errors.npz") as ours, np.load(two / "test_errors.npz") as theirs:
         assert theirs["sample_id"].tolist() == list(range(13))
         assert set(ours) == set(theirs)
-        np.testing.assert_allclose(theirs["errors_mm"], ours["errors_mm"], rtol=1e-3)
+        np.testing.assert_allclose(theirs["mpjpe"], ours["mpjpe"], rtol=1e-3)
 
 
 @pytest.mark.slow

@@ -45,6 +45,13 @@ def test_a_run_leaves_its_files(trained):
     assert json.loads((run_dir / "metrics.json").read_text()) == metrics
     record = json.loads((run_dir / "record.json").read_text())
     assert record["status"] == "complete"
+    assert {key: record[key] for key in ("stage", "headline", "truth", "is_root_relative")} == {
+        "stage": "detector",
+        "headline": ["mpjpe", "pckh"],
+        "truth": ["joints"],
+        "is_root_relative": False,
+    }
+    assert record["metrics"]["pckh"] == {"unit": "%", "goal": "max"}
     assert record["config_hash"] == run_dir.name.rpartition("-")[2]
     assert record["data"]["sizes"] == {"train": 32, "val": 16, "test": 16}
     assert set(record["data"]["bodies"]) == {"female", "male"}
@@ -64,14 +71,17 @@ def test_a_run_leaves_its_files(trained):
     assert rows[-1]["test/mpjpe"]
 
 
-def test_sample_errors_give_the_metrics_again(trained):
+def test_stored_samples_give_the_metrics_again(trained):
     metrics, run_dir = trained
-    with np.load(run_dir / "test_errors.npz") as errors:
-        assert errors["errors_mm"].shape == (16, 24)
-        assert errors["errors_mm"].mean() == pytest.approx(metrics["test/mpjpe"], rel=1e-5)
-        assert errors["initial_errors_mm"].mean() == pytest.approx(metrics["test/initial_mpjpe"], rel=1e-5)
-        distance = np.linalg.norm(errors["pred_joints"] - errors["joints"], axis=-1)
-        np.testing.assert_allclose(1000 * distance, errors["errors_mm"], rtol=1e-4)
+    with np.load(run_dir / "test_errors.npz") as arrays:
+        assert arrays["pred_joints"].shape == arrays["joints"].shape == (16, 24, 3)
+        for name in NAMES:
+            values = arrays[name.removeprefix("test/")]
+            assert (values.shape, values.dtype) == ((16,), np.float64)
+            whole = values.max() if "max" in name else values.mean()
+            assert whole == pytest.approx(metrics[name], rel=1e-6)  # logged in float32
+        distance = np.linalg.norm(arrays["pred_joints"] - arrays["joints"], axis=-1)
+        np.testing.assert_allclose(1000 * distance.mean(1), arrays["mpjpe"], rtol=1e-4)
 
 
 def test_a_complete_run_is_not_trained_again(trained, smoke_config, monkeypatch):

@@ -1,0 +1,150 @@
+"""Metrics over samples as torchmetrics, right under DDP and any split into batches.
+
+Sums are kept in float64, so a result does not depend on the order or the size of the batches.
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar, Literal
+
+import torch
+from torch import Tensor
+from torchmetrics import Metric, MetricCollection
+
+Goal = Literal["min", "max"]
+
+
+class SampleMetric(Metric):
+    """Base: one number of all samples seen; NaN before the first.
+
+    Args:
+        unit: Its unit, such as `"mm"`.
+        goal: Which values are better; None for what describes the data, where none is.
+    """
+
+    is_differentiable = False
+    full_state_update = False
+
+    def __init__(self, unit: str, goal: Goal | None = "min") -> None:
+        super().__init__()
+        self.unit = unit
+        self.goal = goal
+
+    @property
+    def higher_is_better(self) -> bool | None:  # type: ignore[override]
+        """The goal as torchmetrics states it."""
+        return None if self.goal is None else self.goal == "max"
+
+    def update(self, values: Tensor) -> None:
+        """Add a batch: `(B, ...)`, float64."""
+        raise NotImplementedError
+
+    def each(self, values: Tensor) -> Tensor:
+        """What a batch's samples, `(B, ...)`, come to one by one: `(B,)`."""
+        raise NotImplementedError
+
+
+class SampleMean(SampleMetric):
+    """Mean of all values of all samples; see `SampleMetric`."""
+
+    total: Tensor
+    count: Tensor
+
+    def __init__(self, unit: str, goal: Goal | None = "min") -> None:
+        super().__init__(unit, goal)
+        self.add_state("total", torch.zeros((), dtype=torch.float64), dist_reduce_fx="sum")
+        self.add_state("count", torch.zeros((), dtype=torch.int64), dist_reduce_fx="sum")
+
+    def update(self, values: Tensor) -> None:
+        """See `SampleMetric.update`."""
+        # Out of place: a state that a half-precision trainer has cast is float64 again after this.
+        self.total = self.total + values.sum()
+        self.count = self.count + values.numel()
+
+    def compute(self) -> Tensor:
+        """Return the mean, a float64 scalar."""
+        return self.total / self.count
+
+    def each(self, values: Tensor) -> Tensor:
+        """See `SampleMetric.each`."""
+        return values if values.ndim == 1 else values.flatten(1).mean(1)
+
+
+class SampleMax(SampleMetric):
+    """Maximum of all values of all samples, NaN after any NaN; see `SampleMetric`."""
+
+    maximum: Tensor
+
+    def __init__(self, unit: str, goal: Goal | None = "min") -> None:
+        super().__init__(unit, goal)
+        self.add_state("maximum", torch.tensor(-torch.inf, dtype=torch.float64), dist_reduce_fx="max")
+
+    def update(self, values: Tensor) -> None:
+        """See `SampleMetric.update`."""
+        self.maximum = torch.cat([self.maximum[None], values.flatten()]).max()
+
+    def compute(self) -> Tensor:
+        """Return the maximum, a float64 scalar."""
+        return self.maximum.where(~self.maximum.isneginf(), torch.nan)
+
+    def each(self, values: Tensor) -> Tensor:
+        """See `SampleMetric.each`."""
+        return values if values.ndim == 1 else values.flatten(1).amax(1)
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """What a metric is of.
+
+    Attributes:
+        formula: Functional form: tensors in, float64 `(B, ...)` out.
+        arguments: Names of its tensors.
+        unit: See `SampleMetric`.
+        goal: See `SampleMetric`.
+        reduction: What becomes of all samples' values.
+    """
+
+    formula: Callable[..., Tensor]
+    arguments: tuple[str, ...]
+    unit: str = "mm"
+    goal: Goal | None = "min"
+    reduction: type[SampleMetric] = SampleMean
+
+
+class StageMetrics(MetricCollection):
+    """Base: every metric of a stage under its key, for one split. A subclass names them in a table.
+
+    Args:
+        prefix: Put before every key, such as `"val/"`.
+    """
+
+    table: ClassVar[Mapping[str, Quantity]]
+    headline: ClassVar[tuple[str, ...]]
+    """Keys of what a table of results shows, the one that counts most first."""
+
+    def __init__(self, prefix: str | None = None) -> None:
+        super().__init__(
+            {key: of.reduction(of.unit, of.goal) for key, of in self.table.items()},
+            prefix=prefix,
+            # Groups merge metrics whose first batch agrees, as mpjpe and initial_mpjpe do for an untrained
+            # network with zero offsets; they would stay merged ever after.
+            compute_groups=False,
+        )
+
+    @torch.no_grad()
+    def update(self, **tensors: Tensor) -> dict[str, Tensor]:  # type: ignore[override]
+        """Add a batch, given as the table's tensors by name; returns each sample's value of each metric, `(B,)`."""
+        samples = {}
+        metrics: Any = self.items(keep_base=True)
+        for key, metric in metrics:
+            quantity = self.table[key]
+            values = quantity.formula(*(tensors[name] for name in quantity.arguments))
+            metric.update(values)
+            samples[key] = metric.each(values)
+        return samples
+
+    @classmethod
+    def describe(cls) -> dict[str, Any]:
+        """Unit and goal of each metric, and which are the headline ones: goes into records."""
+        metrics = {key: {"unit": of.unit, "goal": of.goal} for key, of in cls.table.items()}
+        return {"metrics": metrics, "headline": list(cls.headline)}
