@@ -14,7 +14,8 @@ import hydra
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from ljn.tasks.processes import is_first_process, is_job_of_sweep
+from ljn.runs.processes import Interruption, end_on_signals, is_first_process
+from ljn.tasks.processes import is_job_of_sweep
 from ljn.tasks.schema import register
 
 register()
@@ -23,6 +24,7 @@ register()
 @hydra.main(version_base="1.3", config_path="conf", config_name="config")
 def main(cfg: DictConfig) -> float | None:
     """Run the task that `cfg.task` names; returns the metric that `cfg.optimized_metric` names."""
+    end_on_signals()  # also in a process that a launcher has started for a job
     if not is_first_process():
         logging.disable(logging.INFO)  # the first process says it for all
     if cfg.group is None and is_job_of_sweep():
@@ -43,4 +45,10 @@ def main(cfg: DictConfig) -> float | None:
 
 
 if __name__ == "__main__":
-    main()
+    end_on_signals()
+    try:
+        main()
+    except Interruption as interruption:
+        if is_first_process():
+            print(f"ended by {interruption.name}: a training is resumed by the same command", file=sys.stderr)
+        raise

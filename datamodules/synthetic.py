@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import BatchSampler, DataLoader, Dataset
 
-from datamodules.batches import EpochSampler, SharedBatches, fixed_batches
+from datamodules.batches import ByValue, EpochSampler, SharedBatches, check_workers, fixed_batches
 from datamodules.cache import cached_samples
 from datamodules.sources import PoseRecords, PoseSource
 from datamodules.synthesis import DepthSynthesizer, SynthesisSettings, concatenate
@@ -244,7 +244,9 @@ class SyntheticDepthDataModule(BodyDataModule):
         """Samples rendered as they are needed; the last, incomplete batch is dropped."""
         if self._train is None:
             raise RuntimeError("setup('fit') has not been called")
-        sampler: Any = EpochSampler(self.sizes["train"], self.seed, self.redraw_each_epoch)
+        # The trainer asks for batches before it says which epoch it resumes in: workers would make the first one's.
+        epoch = self.trainer.fit_loop.epoch_progress.current.processed if self.trainer else 0
+        sampler: Any = EpochSampler(self.sizes["train"], self.seed, self.redraw_each_epoch, epoch)
         batches = BatchSampler(sampler, self.batch_size, drop_last=len(sampler) >= self.batch_size)
         return self._loader(SynthesizedSamples(self._train), SharedBatches(batches, *self._process))
 
@@ -289,10 +291,12 @@ class SyntheticDepthDataModule(BodyDataModule):
         return self.settings.renderer == "pyrender"
 
     def _loader(self, samples: Dataset, batches: Any, persistent: bool = True) -> DataLoader:
+        if self.num_workers > 0:
+            check_workers(self.num_workers)
         return DataLoader(
             samples,
             batch_sampler=batches,
-            collate_fn=_as_is,
+            collate_fn=ByValue if self.num_workers > 0 else _as_is,
             num_workers=self.num_workers,
             # A GL context does not survive a fork.
             multiprocessing_context="spawn" if self._uses_gl and self.num_workers > 0 else None,

@@ -20,7 +20,7 @@ from ljn.pipeline.inputs import DEPTH_SUFFIXES, read_camera, read_depth, read_ke
 from ljn.pipeline.pictures import draw_prediction
 from ljn.pipeline.pipeline import Observation, Pipeline, Prediction
 from ljn.pipeline.writing import import_trimesh, write_arrays, write_mesh
-from ljn.runs.files import write_json
+from ljn.runs.files import path_part, write_json
 from ljn.tasks.validation import check_writable
 
 _LOG = logging.getLogger(__name__)
@@ -71,7 +71,7 @@ def predict(cfg: DictConfig) -> dict[str, float]:
             raise ValueError(f"{key}: expected a path, got null; {_COMMAND}")
     camera = read_camera(cfg.camera)
     frames = find_frames(cfg.input, cfg.keypoints, cfg.mask)
-    directory = Path(cfg.paths.output_dir) / "predictions" / Path(cfg.input).stem
+    directory = Path(cfg.paths.output_dir) / "predictions" / path_part(Path(cfg.input).stem)
     check_writable(directory)
     if cfg.mesh_ckpt_path is not None:
         import_trimesh()

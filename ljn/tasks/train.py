@@ -15,7 +15,7 @@ from ljn.building import build, build_each
 from ljn.data import BodyDataModule
 from ljn.modules.base import StageModule
 from ljn.runs.checkpoints import AtomicCheckpointIO, Provenance, read_checkpoint
-from ljn.runs.files import read_json, write_json
+from ljn.runs.files import path_part, read_json, write_json, write_text_atomically
 from ljn.runs.identity import config_hash, identity
 from ljn.runs.record import RunRecord, alone_in, is_complete
 from ljn.tasks.processes import check_trains_in_processes, is_first_process, num_processes, own_devices
@@ -113,7 +113,7 @@ def _train(
 
 def set_run_directory(cfg: DictConfig, kind: str, identity_hash: str) -> Path:
     """Name the directory `output_dir/kind/NAME-PRESET-HASH` and make it `paths.run_dir`."""
-    name = f"{cfg.name.replace('/', '-')}-{cfg.preset.name}-{identity_hash}"
+    name = f"{path_part(cfg.name)}-{path_part(cfg.preset.name)}-{identity_hash}"
     run_dir = Path(cfg.paths.output_dir) / kind / name
     with open_dict(cfg):
         cfg.paths.run_dir = str(run_dir)
@@ -177,5 +177,5 @@ def save_config(cfg: DictConfig, run_dir: Path) -> dict[str, Any]:
     """Write `config.yaml`, resolved, in the first process; returns the same as plain values."""
     config: dict[str, Any] = OmegaConf.to_container(cfg, resolve=True)  # type: ignore[assignment]
     if is_first_process():
-        (run_dir / "config.yaml").write_text(OmegaConf.to_yaml(OmegaConf.create(config)))
+        write_text_atomically(run_dir / "config.yaml", OmegaConf.to_yaml(OmegaConf.create(config)))
     return config

@@ -1,5 +1,7 @@
+import errno
 import logging
 import math
+import multiprocessing
 import os
 import resource
 
@@ -166,6 +168,8 @@ def test_training_batches_are_the_same_bits_with_and_without_a_worker(train_load
         for epoch in (0, 1, 1):  # the worker lives on through the epochs
             for plain, worked in zip(*(batches_of(loader, epoch) for loader in loaders)):
                 assert_same_bits(plain, worked)
+                # A small /dev/shm would fill up, and the batch be lost.
+                assert not any(value.is_shared() for value in worked.values())
     finally:
         torch.set_num_threads(threads)
 
@@ -300,6 +304,18 @@ def test_a_poses_heading_that_was_dropped_cannot_be_kept(make_datamodule):
 def test_training_batches_before_setup_are_an_error(make_datamodule):
     with pytest.raises(RuntimeError, match="has not been called"):
         make_datamodule().train_dataloader()
+
+
+def test_workers_that_the_system_has_no_room_for_are_found_before_anything_is_rendered(
+    make_datamodule, monkeypatch
+):
+    def full():
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(multiprocessing, "Queue", full)
+    with pytest.raises(ValueError, match=r"No space left.*data\.num_workers=0.*docker run --shm-size"):
+        make_datamodule(num_workers=2).setup("fit")
+    make_datamodule(num_val=1).setup("fit")
 
 
 # Memory
