@@ -244,9 +244,7 @@ class SyntheticDepthDataModule(BodyDataModule):
         """Samples rendered as they are needed; the last, incomplete batch is dropped."""
         if self._train is None:
             raise RuntimeError("setup('fit') has not been called")
-        # The trainer asks for batches before it says which epoch it resumes in: workers would make the first one's.
-        epoch = self.trainer.fit_loop.epoch_progress.current.processed if self.trainer else 0
-        sampler: Any = EpochSampler(self.sizes["train"], self.seed, self.redraw_each_epoch, epoch)
+        sampler: Any = EpochSampler(self.sizes["train"], self.seed, self.redraw_each_epoch, self._first_epoch)
         batches = BatchSampler(sampler, self.batch_size, drop_last=len(sampler) >= self.batch_size)
         return self._loader(SynthesizedSamples(self._train), SharedBatches(batches, *self._process))
 
@@ -267,6 +265,17 @@ class SyntheticDepthDataModule(BodyDataModule):
     def _process(self) -> tuple[int, int]:
         """This process's number among those of the run, and how many there are."""
         return (self.trainer.global_rank, self.trainer.world_size) if self.trainer else (0, 1)
+
+    @property
+    def _first_epoch(self) -> int:
+        """The epoch that the trainer begins or resumes with.
+
+        It says so itself only after it has asked for batches, when workers have already begun.
+        """
+        if not self.trainer:
+            return 0
+        progress: Any = self.trainer.fit_loop.epoch_progress.current
+        return progress.processed
 
     def fixed_key(self, split: str) -> str:
         """Hash of everything that a fixed set depends on; a detector works on it afterwards."""
@@ -303,6 +312,8 @@ class SyntheticDepthDataModule(BodyDataModule):
             persistent_workers=persistent and self.num_workers > 0,
             prefetch_factor=self.prefetch_batches if self.num_workers > 0 else None,
             worker_init_fn=_one_thread,
+            # Rendering fixed sets draws no global random numbers: a run with dropout is the same when it reads them.
+            generator=None if persistent else torch.Generator(),
         )
 
 

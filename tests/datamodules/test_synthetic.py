@@ -106,6 +106,12 @@ def test_a_fixed_set_is_rendered_once_and_shared_by_data_modules_that_want_the_s
         assert "rendering" not in caplog.text
 
 
+def test_rendering_a_fixed_set_draws_no_global_random_numbers(make_datamodule):
+    before = torch.get_rng_state()
+    make_datamodule(num_val=1).setup("validate")
+    assert torch.equal(torch.get_rng_state(), before)
+
+
 def test_the_test_set_is_another_than_the_validation_set(make_datamodule):
     datamodule = make_datamodule(num_val=8, num_test=8)
     datamodule.setup("validate")
