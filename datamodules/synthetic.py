@@ -302,6 +302,8 @@ class SyntheticDepthDataModule(BodyDataModule):
     def _loader(self, samples: Dataset, batches: Any, persistent: bool = True) -> DataLoader:
         if self.num_workers > 0:
             check_workers(self.num_workers)
+        # A training's one global draw is a loader's own, which dropout has always come after.
+        seed = int(torch.empty((), dtype=torch.int64).random_()) if persistent else 0
         return DataLoader(
             samples,
             batch_sampler=batches,
@@ -312,8 +314,8 @@ class SyntheticDepthDataModule(BodyDataModule):
             persistent_workers=persistent and self.num_workers > 0,
             prefetch_factor=self.prefetch_batches if self.num_workers > 0 else None,
             worker_init_fn=_one_thread,
-            # Rendering fixed sets draws no global random numbers: a run with dropout is the same when it reads them.
-            generator=None if persistent else torch.Generator(),
+            # Not the global one: dropout would depend on the number of workers, and on which fixed sets were there.
+            generator=torch.Generator().manual_seed(seed),
         )
 
 

@@ -17,6 +17,7 @@ from ljn.modules.base import StageModule
 from ljn.runs.checkpoints import AtomicCheckpointIO, Provenance, read_checkpoint
 from ljn.runs.files import path_part, read_json, write_json, write_text_atomically
 from ljn.runs.identity import config_hash, identity
+from ljn.runs.random_state import RandomState
 from ljn.runs.record import RunRecord, alone_in, is_complete
 from ljn.tasks.processes import check_trains_in_processes, is_first_process, num_processes, own_devices
 from ljn.tasks.tracking import tracking
@@ -150,7 +151,7 @@ def build_trainer(
     return build(
         cfg.trainer,
         default_root_dir=str(run_dir),
-        callbacks=[*build_each(cfg.callbacks), provenance],
+        callbacks=[*build_each(cfg.callbacks), provenance, RandomState()],
         logger=build_each(cfg.logger),
         plugins=[AtomicCheckpointIO()],
         use_distributed_sampler=False,  # the data module gives each process its part, and none twice

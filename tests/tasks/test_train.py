@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import time
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -102,24 +103,38 @@ class Stop(Callback):
 
 
 RESUMED = (
-    "experiment=detector/proposed",
-    "trainer.max_epochs=4",
+    "trainer.max_epochs=3",
     "preset.scheduler.step_size=1",
     "preset.scheduler.gamma=0.5",
+    "callbacks.pictures=null",
 )
 
 
 @pytest.fixture(scope="module")
 def uninterrupted(smoke_config, tmp_path_factory):
-    cfg = smoke_config(tmp_path_factory.mktemp("whole"), *RESUMED)
-    return train(cfg), weights(Path(cfg.paths.run_dir))
+    """Metrics and weights of an experiment's run without workers, trained once."""
+
+    @cache
+    def run(experiment):
+        cfg = smoke_config(tmp_path_factory.mktemp("whole"), f"experiment={experiment}", *RESUMED)
+        return train(cfg), weights(Path(cfg.paths.run_dir))
+
+    return run
 
 
-@pytest.mark.parametrize(("epoch", "num_workers"), [(1, 0), (3, 0), (1, 1), (2, 2)])
+@pytest.mark.parametrize(
+    ("experiment", "epoch", "num_workers"),
+    [
+        ("detector/proposed", 2, 0),
+        ("detector/proposed", 1, 1),
+        ("detector/proposed", 2, 2),
+        ("detector/simple_baseline", 2, 1),  # with dropout
+    ],
+)
 def test_a_resumed_run_equals_an_uninterrupted_one(
-    uninterrupted, smoke_config, tmp_path, monkeypatch, epoch, num_workers
+    uninterrupted, smoke_config, tmp_path, monkeypatch, experiment, epoch, num_workers
 ):
-    cfg = smoke_config(tmp_path, *RESUMED, f"data.num_workers={num_workers}")
+    cfg = smoke_config(tmp_path, f"experiment={experiment}", *RESUMED, f"data.num_workers={num_workers}")
     original = train_task.build_each
     with monkeypatch.context() as patch:
         patch.setattr(
@@ -132,7 +147,7 @@ def test_a_resumed_run_equals_an_uninterrupted_one(
     run_dir = Path(cfg.paths.run_dir)
     assert json.loads((run_dir / "record.json").read_text())["status"] == "failed"
 
-    metrics, theirs = uninterrupted
+    metrics, theirs = uninterrupted(experiment)
     assert train(cfg) == metrics
     ours = weights(run_dir)
     assert all(torch.equal(ours[name], theirs[name]) for name in ours)
@@ -150,15 +165,14 @@ class Seen(Callback):
         self.samples.append((trainer.current_epoch, batch["sample_id"].tolist()))
 
 
-@pytest.mark.parametrize("num_workers", [1, 2])
-def test_every_epoch_shows_its_own_samples_in_its_own_order(smoke_config, tmp_path, monkeypatch, num_workers):
+def test_every_epoch_shows_its_own_samples_in_its_own_order(smoke_config, tmp_path, monkeypatch):
     seen, original = Seen(), train_task.build_each
     monkeypatch.setattr(
         train_task, "build_each", lambda node: [*original(node), *([seen] if "best" in node else [])]
     )
-    train(smoke_config(tmp_path, *RESUMED, f"data.num_workers={num_workers}", "callbacks.pictures=null"))
+    train(smoke_config(tmp_path, "experiment=detector/basic", *RESUMED, "data.num_workers=2"))
     expected = []
-    for epoch in range(4):
+    for epoch in range(3):
         order = [index for _, index in EpochSampler(32, seed=0, epoch=epoch)]
         expected += [(epoch, order[start : start + 8]) for start in range(0, 32, 8)]
     assert seen.samples == expected
