@@ -17,7 +17,7 @@ from omegaconf import OmegaConf
 from datamodules.batches import EpochSampler
 from ljn.runs.files import read_json
 from ljn.tasks import train as train_task
-from ljn.tasks.train import train
+from ljn.tasks.train import set_run_directory, train
 
 ROOT = Path(__file__).parents[2]
 NAMES = {
@@ -222,6 +222,11 @@ def test_a_damaged_checkpoint_to_resume_from_is_named(smoke_config, tmp_path):
     (run_dir / "checkpoints" / "last.ckpt").write_bytes(b"half a")
     with pytest.raises(ValueError, match=r"last\.ckpt' is damaged"):
         train(cfg)
+
+
+def test_names_from_a_configuration_lead_to_no_other_directory(smoke_config, tmp_path):
+    cfg = smoke_config(tmp_path, "name=../../up", "preset.name='../up'")
+    assert set_run_directory(cfg, "runs", "hash") == tmp_path / "runs" / "--..-up---up-hash"
 
 
 def test_another_content_of_the_pose_file_is_another_run(smoke_config, tmp_path):
