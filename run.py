@@ -14,8 +14,9 @@ import hydra
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
+from ljn.runs.processes import Interruption, end_on_signals, is_first_process
 from ljn.tasks.arguments import prepare_arguments
-from ljn.tasks.processes import is_first_process, is_job_of_sweep, sweep_name
+from ljn.tasks.processes import is_job_of_sweep, sweep_name
 from ljn.tasks.schema import register
 
 register()
@@ -24,6 +25,7 @@ register()
 @hydra.main(version_base="1.3", config_path="conf", config_name="config")
 def main(cfg: DictConfig) -> float | None:
     """Run the task that `cfg.task` names; returns the metric that `cfg.optimized_metric` names."""
+    end_on_signals()  # also in a process that a launcher has started for a job
     if not is_first_process():
         logging.disable(logging.INFO)  # the first process says it for all
     if cfg.group is None and is_job_of_sweep():
@@ -42,8 +44,14 @@ def main(cfg: DictConfig) -> float | None:
 
 
 if __name__ == "__main__":
+    end_on_signals()
     try:
         sys.argv[1:] = prepare_arguments(sys.argv[1:])
     except ValueError as error:
         sys.exit(f"error: {error}")
-    main()
+    try:
+        main()
+    except Interruption as interruption:
+        if is_first_process():
+            print(f"ended by {interruption.name}: a training is resumed by the same command", file=sys.stderr)
+        raise

@@ -15,7 +15,7 @@ from omegaconf import DictConfig
 
 from ljn.report import write_report
 from ljn.runs import layout
-from ljn.runs.files import read_json, write_json
+from ljn.runs.files import path_part, read_json, write_json
 from ljn.runs.sweep import job_of, read_jobs, settings
 from ljn.tasks.processes import sweep_name
 
@@ -35,28 +35,35 @@ class SweepReport(Callback):
         self.output_dir = Path(output_dir)
         self._sweep: DictConfig | None = None
 
+    def on_job_start(self, config: DictConfig, **kwargs: Any) -> None:
+        """Note that a job runs: so it stays, without a result, where the sweep ends in the middle of it."""
+        if config.hydra.mode == RunMode.MULTIRUN:
+            self._note(config, run_dir=None, status="running", error=None)
+
     def on_job_end(self, config: DictConfig, job_return: JobReturn, **kwargs: Any) -> None:
         """Note what became of a job; write the tables of all so far."""
         if config.hydra.mode != RunMode.MULTIRUN:
             return
         assert job_return.cfg is not None
-        is_complete = job_return.status == JobStatus.COMPLETED
-        # Of a failed job, reading `return_value` would raise it.
-        error = None if is_complete else job_return._return_value
-        typed = list(config.hydra.overrides.task)
-        note = {
-            "experiment": config.hydra.runtime.choices.get("experiment"),
-            "overrides": typed,
-            "seed": job_return.cfg.seed,
-            "run_dir": self._relative(job_return.cfg.paths.run_dir),
-            "status": "complete" if is_complete else "failed",
-            "error": None if is_complete else f"{type(error).__name__}: {error}",
-        }
-        notes = self._notes(config)
-        notes.mkdir(parents=True, exist_ok=True)
-        write_json(notes / f"{int(config.hydra.job.num):04d}.json", note)
+        run_dir = self._relative(job_return.cfg.paths.run_dir)
+        if job_return.status == JobStatus.COMPLETED:
+            self._note(config, run_dir=run_dir, status="complete", error=None)
+        else:
+            error = job_return._return_value  # reading `return_value` would raise it
+            self._note(config, run_dir=run_dir, status="failed", error=f"{type(error).__name__}: {error}")
         write_report(self._gather(config), is_final=False)
         self._see_to_the_end()
+
+    def _note(self, config: DictConfig, **outcome: str | None) -> None:
+        """Write a job's note, which takes the place of an earlier one."""
+        notes = self._notes(config)
+        notes.mkdir(parents=True, exist_ok=True)
+        job = {
+            "experiment": config.hydra.runtime.choices.get("experiment"),
+            "overrides": list(config.hydra.overrides.task),
+            "seed": config.seed,
+        }
+        write_json(notes / f"{int(config.hydra.job.num):04d}.json", job | outcome)
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
         """See to it that the sweep is summed up however it ends."""
@@ -85,7 +92,7 @@ class SweepReport(Callback):
 
     def _sum_up(self) -> None:
         """Write and print the tables of all jobs, and the page; log the table to the tracker."""
-        if self._sweep is None or not self._notes(self._sweep).is_dir():  # not one job came to its end
+        if self._sweep is None or not self._notes(self._sweep).is_dir():  # not one job was started
             return
         directory = self._gather(self._sweep)
         report = write_report(directory)
@@ -109,16 +116,20 @@ class SweepReport(Callback):
     def _gather(self, config: DictConfig) -> Path:
         """Write `sweep.json` from the jobs' notes; returns its directory."""
         name, preset = sweep_name(config.hydra), config.preset.name
-        directory = self.output_dir / "sweeps" / (name if name == preset else f"{name}-{preset}")
+        parts = dict.fromkeys([path_part(name), path_part(preset)])  # once where they are the same
+        directory = self.output_dir / "sweeps" / "-".join(parts)
         directory.mkdir(parents=True, exist_ok=True)
-        notes = map(read_json, sorted(self._notes(config).glob("*.json")))
-        jobs = [job_of(note) for note in notes if note]
-        # What earlier calls have done stays in the tables: other seeds, and what this call has not reached; what
-        # failed, among this call's rows.
-        rows, known = {_row(job, preset) for job in jobs}, {(_row(job, preset), job["seed"]) for job in jobs}
-        for job in read_jobs(directory):
-            row = _row(job, preset)
-            if (row, job["seed"]) not in known and (job["status"] == "complete" or row in rows):
+        notes = [job_of(note) for note in map(read_json, sorted(self._notes(config).glob("*.json"))) if note]
+        # What earlier calls have done stays in the tables: other seeds, and what this call has not reached or has
+        # not finished; what failed, among this call's rows.
+        earlier = read_jobs(directory)
+        done = {_key(job, preset) for job in earlier if job["status"] == "complete"}
+        jobs = [note for note in notes if note["status"] != "running" or _key(note, preset) not in done]
+        known = {_key(job, preset) for job in jobs}
+        rows = {row for row, _ in known}
+        for job in earlier:
+            row, seed = _key(job, preset)
+            if (row, seed) not in known and (job["status"] == "complete" or row in rows):
                 jobs.append(job)
         content = {
             "name": name,
@@ -135,9 +146,9 @@ class SweepReport(Callback):
         return None if run_dir is None else os.path.relpath(run_dir, self.output_dir)
 
 
-def _row(job: dict[str, Any], preset: str) -> tuple[Any, ...]:
-    """What two jobs share that differ in their seeds alone."""
-    return job["experiment"], settings(job["overrides"], preset)
+def _key(job: dict[str, Any], preset: str) -> tuple[tuple[Any, ...], Any]:
+    """What tells a job from others: its row, which jobs share that differ in their seeds alone, and its seed."""
+    return (job["experiment"], settings(job["overrides"], preset)), job["seed"]
 
 
 def _as_number(value: str) -> float | str:

@@ -1,10 +1,12 @@
-"""Which samples make a batch, in one process or shared out among several."""
+"""Which samples make a batch, in one process or shared out among several, and how workers hand it over."""
 
-from collections.abc import Iterator
+import multiprocessing
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 from torch.utils.data import BatchSampler, Sampler
 
 
@@ -12,13 +14,19 @@ class EpochSampler(Sampler[tuple[int, int]]):
     """Indices in an order drawn anew for each epoch, each with the epoch's number beside it.
 
     The number travels with the index, so that workers that live on through epochs draw anew without being told.
+
+    Args:
+        num_samples: Samples in an epoch.
+        seed: Seed of the order.
+        redraws: Whether the number beside an index is the epoch's; else it is 0 in every epoch.
+        epoch: The first epoch that is asked for. Workers begin with it before the trainer calls `set_epoch`.
     """
 
-    def __init__(self, num_samples: int, seed: int, redraws: bool = True) -> None:
+    def __init__(self, num_samples: int, seed: int, redraws: bool = True, epoch: int = 0) -> None:
         self.num_samples = num_samples
         self.seed = seed
         self.redraws = redraws
-        self.epoch = 0
+        self.epoch = epoch
 
     def set_epoch(self, epoch: int) -> None:
         """Called by the trainer before each epoch."""
@@ -77,3 +85,34 @@ def fixed_batches(size: int, batch_size: int, process: int = 0, num_processes: i
     own = np.array_split(np.arange(size), num_processes)[process]
     number = min(-(-size // batch_size), size // num_processes)
     return [part.tolist() for part in np.array_split(own, number)]
+
+
+class ByValue(dict[str, Tensor]):
+    """A batch that goes to another process through a pipe, as bytes, and arrives there as a plain dict.
+
+    PyTorch would hand tensors over in shared memory. Where `/dev/shm` is small (64 MB in a container), it fills up;
+    the batch is lost and the training process waits for it for ever.
+    """
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _received, ({name: value.numpy() for name, value in self.items()},)
+
+
+def _received(arrays: Mapping[str, np.ndarray]) -> dict[str, Tensor]:
+    # Copied into PyTorch's own memory, since products may round by how their operands are aligned.
+    return {name: torch.tensor(array) for name, array in arrays.items()}
+
+
+def check_workers(num_workers: int) -> None:
+    """Raise a `ValueError` unless the system has room for the queues of this many worker processes.
+
+    A queue takes pipes and semaphores, and on Linux a semaphore takes a page of `/dev/shm`.
+    """
+    try:
+        _ = [multiprocessing.Queue() for _ in range(num_workers + 3)]
+    except OSError as error:
+        raise ValueError(
+            f"num_workers: the queues of {num_workers} workers cannot be made ({error.strerror}): too little room in "
+            "/dev/shm, or too few open files allowed; use data.num_workers=0, give a container more with "
+            "`docker run --shm-size=64m`, or raise `ulimit -n`"
+        ) from error

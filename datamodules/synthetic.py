@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import BatchSampler, DataLoader, Dataset
 
-from datamodules.batches import EpochSampler, SharedBatches, fixed_batches
+from datamodules.batches import ByValue, EpochSampler, SharedBatches, check_workers, fixed_batches
 from datamodules.cache import cached_samples
 from datamodules.placement import check_margin
 from datamodules.sources import PoseRecords, PoseSource
@@ -230,7 +230,7 @@ class SyntheticDepthDataModule(BodyDataModule):
         """Samples rendered as they are needed; the last, incomplete batch is dropped."""
         if self._train is None:
             raise RuntimeError("setup('fit') has not been called")
-        sampler: Any = EpochSampler(self.sizes["train"], self.seed, self.redraw_each_epoch)
+        sampler: Any = EpochSampler(self.sizes["train"], self.seed, self.redraw_each_epoch, self._first_epoch)
         batches = BatchSampler(sampler, self.batch_size, drop_last=len(sampler) >= self.batch_size)
         return self._loader(SynthesizedSamples(self._train), SharedBatches(batches, *self._process))
 
@@ -251,6 +251,17 @@ class SyntheticDepthDataModule(BodyDataModule):
     def _process(self) -> tuple[int, int]:
         """This process's number among those of the run, and how many there are."""
         return (self.trainer.global_rank, self.trainer.world_size) if self.trainer else (0, 1)
+
+    @property
+    def _first_epoch(self) -> int:
+        """The epoch that the trainer begins or resumes with.
+
+        It says so itself only after it has asked for batches, when workers have already begun.
+        """
+        if not self.trainer:
+            return 0
+        progress: Any = self.trainer.fit_loop.epoch_progress.current
+        return progress.processed
 
     def fixed_key(self, split: str) -> str:
         """Hash of everything that a fixed set depends on; a detector works on it afterwards."""
@@ -276,16 +287,22 @@ class SyntheticDepthDataModule(BodyDataModule):
         return self.synthesis.renderer == "pyrender"
 
     def _loader(self, samples: Dataset, batches: Any, persistent: bool = True) -> DataLoader:
+        if self.num_workers > 0:
+            check_workers(self.num_workers)
+        # A training's one global draw is a loader's own, which dropout has always come after.
+        seed = int(torch.empty((), dtype=torch.int64).random_()) if persistent else 0
         return DataLoader(
             samples,
             batch_sampler=batches,
-            collate_fn=_as_is,
+            collate_fn=ByValue if self.num_workers > 0 else _as_is,
             num_workers=self.num_workers,
             # A GL context does not survive a fork.
             multiprocessing_context="spawn" if self._uses_gl and self.num_workers > 0 else None,
             persistent_workers=persistent and self.num_workers > 0,
             prefetch_factor=self.prefetch_batches if self.num_workers > 0 else None,
             worker_init_fn=_one_thread,
+            # Not the global one: dropout would depend on the number of workers, and on which fixed sets were there.
+            generator=torch.Generator().manual_seed(seed),
         )
 
 

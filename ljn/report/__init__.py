@@ -1,6 +1,5 @@
 """A finished sweep as tables (CSV, Markdown, LaTeX, plain text) and one HTML page, the thesis's numbers beside ours."""
 
-import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,6 +8,7 @@ from ljn.report.results import Results, read_results
 from ljn.report.tables import TABLES
 from ljn.report.writers import to_csv, to_latex, to_markdown, to_text
 from ljn.runs import layout
+from ljn.runs.files import write_text_atomically
 
 __all__ = ["TABLES", "Report", "Results", "read_results", "write_report"]
 
@@ -52,10 +52,6 @@ def write_report(directory: Path, is_final: bool = True) -> Report:
     paths = []
     for name, content in contents.items():
         path = directory / name
-        draft = path.with_name(
-            f"{name}.{os.getpid()}.tmp"
-        )  # jobs side by side write, each in a process of its own
-        draft.write_text(content, encoding="utf-8")
-        draft.replace(path)
+        write_text_atomically(path, content)
         paths.append(path)
     return Report(to_text(results), bool(results.lost), tuple(paths))

@@ -1,8 +1,9 @@
-"""JSON files of runs: written whole or not at all, read without trusting them."""
+"""Files of runs: named safely, written whole or not at all, read without trusting them."""
 
 import json
 import math
 import os
+import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -16,9 +17,27 @@ _MAX_METRIC = 1e100
 
 def write_json(path: Path, content: Mapping[str, Any]) -> None:
     """Write a JSON file, whole or not at all. NaN and infinity are written as null."""
+    write_text_atomically(path, json.dumps(_finite(content), indent=2, allow_nan=False) + "\n")
+
+
+def write_text_atomically(path: Path, text: str) -> None:
+    """Write a text file, whole or not at all: after a failure the old one is there, and nothing beside it."""
+    # Jobs side by side write the same files, each in a process of its own.
     draft = path.with_name(f"{path.name}.{os.getpid()}.tmp")
-    draft.write_text(json.dumps(_finite(content), indent=2, allow_nan=False) + "\n")
-    draft.replace(path)
+    try:
+        draft.write_text(text, encoding="utf-8")
+        draft.replace(path)
+    finally:
+        draft.unlink(missing_ok=True)
+
+
+def path_part(text: str) -> str:
+    """A name from a configuration or a file as one part of a path: never a way to another directory.
+
+    Separators and control characters become "-", and so do dots at its beginning; what is left of a long name is
+    its first 100 characters.
+    """
+    return re.sub(r"^\.+|[/\\\x00-\x1f\x7f]", "-", text)[:100] or "-"
 
 
 def read_json(path: Path) -> dict[str, Any] | None:

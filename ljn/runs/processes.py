@@ -1,8 +1,51 @@
-"""The processes of one run, of which the first one alone writes."""
+"""The processes of one run, of which the first one alone writes, and how a signal ends them."""
 
+import math
 import os
+import signal
+import threading
+import time
 from collections.abc import Mapping
 from typing import Any
+
+_APART_S = 2.0
+
+
+class Interruption(SystemExit):
+    """SIGTERM (`docker stop`, SLURM, `kill`) or Ctrl-C: ends the process with the code 128 + the signal's number.
+
+    Attributes:
+        name: `SIGTERM` or `SIGINT`.
+    """
+
+    def __init__(self, number: int) -> None:
+        super().__init__(128 + number)
+        self.name = signal.Signals(number).name
+
+
+def end_on_signals() -> None:
+    """Let SIGTERM and Ctrl-C raise `Interruption`, so that records and tables are written before the process ends.
+
+    By itself Python dies of SIGTERM at once, and Lightning turns it into a success. A signal that follows closely
+    upon another (many tools send both a group and its first process one) does nothing. A handler that somebody else
+    has set (a launcher's, say) stays.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        return
+    last = -math.inf
+
+    def end(number: int, frame: Any) -> None:
+        nonlocal last
+        before, last = last, time.monotonic()
+        if last - before > _APART_S:
+            raise Interruption(number)
+
+    for number, default in (
+        (signal.SIGTERM, signal.SIG_DFL),
+        (signal.SIGINT, signal.default_int_handler),
+    ):
+        if signal.getsignal(number) == default:
+            signal.signal(number, end)
 
 
 def process_number() -> int:

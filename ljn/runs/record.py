@@ -69,11 +69,14 @@ class RunRecord:
     ) -> None:
         if error is None:
             self.add(status="complete")
-        elif isinstance(error, KeyboardInterrupt | SystemExit):
-            # The trainer turns Ctrl-C into SystemExit once it has shut down.
-            self.add(status="interrupted")
-        else:
-            self.add(status="failed", error=f"{type(error).__name__}: {error}")
+            return
+        # What ends a process, such as `Interruption`, is no error of the run.
+        is_failure = isinstance(error, Exception)
+        ending = {"status": "failed", "error": f"{type(error).__name__}: {error}"}
+        try:
+            self.add(**ending if is_failure else {"status": "interrupted"})
+        except OSError as unwritten:  # the error that ended the run is the one to see
+            _LOG.warning("%s: the record's last state cannot be written: %s", self.directory, unwritten)
 
     def _write(self) -> None:
         if not self._writes:

@@ -1,4 +1,4 @@
-"""The command line before Hydra reads it: paths that its grammar would take apart, keys that have moved."""
+"""The command line before Hydra reads it: paths that its grammar would take apart, short names of keys."""
 
 import os
 import re
@@ -20,18 +20,22 @@ _NOT_BARE = re.compile(r"""$|null$|['"\[]|.*\$\{|.*,|(choice|glob|tag)\(""")
 def prepare_arguments(arguments: Sequence[str]) -> list[str]:
     """A command line's arguments with every path in quotes, as Hydra needs it for `2023_04_01` or `a=b`.
 
-    Paths that begin with `~` are those of the user's home.
+    Paths that begin with `~` are those of the user's home. With `task=predict`, its keys may be typed without their
+    `task.`, as in `input=DEPTH.png`.
 
     Raises:
-        ValueError: A key of `task=predict` is without its `task.`.
+        ValueError: A key of `task=predict` is given to another task.
     """
-    return [_prepare(argument) for argument in arguments]
+    return [_prepare(argument, "task=predict" in arguments) for argument in arguments]
 
 
-def _prepare(argument: str) -> str:
+def _prepare(argument: str, is_predict: bool) -> str:
     key, equals, value = argument.partition("=")
     if key in _OF_PREDICT and equals:
-        raise ValueError(f"{key}: it is a key of the task; write task=predict task.{argument}")
+        if not is_predict:
+            raise ValueError(f"{key}: only task=predict reads this; add task=predict, or leave it out")
+        key = f"task.{key}"
+        argument = f"{key}={value}"
     path = os.path.expanduser(value)
     if key not in _PATHS or (_NOT_BARE.match(value) and not os.path.exists(path)):
         return argument

@@ -19,7 +19,7 @@ from ljn.pipeline.inputs import read_camera
 from ljn.pipeline.pictures import draw_prediction
 from ljn.pipeline.pipeline import Pipeline, Prediction
 from ljn.pipeline.writing import import_trimesh, write_arrays, write_mesh
-from ljn.runs.files import write_json
+from ljn.runs.files import path_part, write_json
 from ljn.tasks.validation import check_writable
 
 _LOG = logging.getLogger(__name__)
@@ -58,7 +58,7 @@ def predict(cfg: DictConfig) -> dict[str, float]:
             raise ValueError(f"{key}: expected a path, got {got}; {_COMMAND}")
     camera = read_camera(task.camera)
     frames = find_frames(task.input, task.keypoints, task.mask)
-    directory = Path(cfg.paths.output_dir) / "predictions" / Path(task.input).stem
+    directory = Path(cfg.paths.output_dir) / "predictions" / path_part(Path(task.input).stem)
     check_writable(directory)
     if task.mesh_ckpt_path is not None:
         import_trimesh()

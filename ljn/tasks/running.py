@@ -16,7 +16,10 @@ from ljn.data import BodyDataModule
 from ljn.modules.base import StageModule
 from ljn.runs import layout
 from ljn.runs.checkpoints import AtomicCheckpointIO, Provenance
-from ljn.tasks.processes import is_first_process, num_processes, own_devices
+from ljn.runs.files import path_part, write_text_atomically
+from ljn.runs.processes import is_first_process, num_processes
+from ljn.runs.random_state import RandomState
+from ljn.tasks.processes import own_devices
 
 # What Lightning says of things that are as they should be.
 _EXPECTED_WARNINGS = (
@@ -30,7 +33,7 @@ _EXPECTED_WARNINGS = (
 
 def set_run_directory(cfg: DictConfig, kind: str, identity_hash: str) -> Path:
     """Name the directory `output_dir/kind/NAME-PRESET-HASH` and make it `paths.run_dir`."""
-    name = f"{cfg.name.replace('/', '-')}-{cfg.preset.name}-{identity_hash}"
+    name = f"{path_part(cfg.name)}-{path_part(cfg.preset.name)}-{identity_hash}"
     run_dir = Path(cfg.paths.output_dir) / kind / name
     with open_dict(cfg):
         cfg.paths.run_dir = str(run_dir)
@@ -69,7 +72,7 @@ def build_trainer(
     return build(
         cfg.trainer,
         default_root_dir=str(run_dir),
-        callbacks=[*build_each(cfg.callbacks), provenance],
+        callbacks=[*build_each(cfg.callbacks), provenance, RandomState()],
         logger=build_each(cfg.logger),
         plugins=[AtomicCheckpointIO()],
         use_distributed_sampler=False,  # the data module gives each process its part, and none twice
@@ -96,5 +99,5 @@ def save_config(cfg: DictConfig, run_dir: Path) -> dict[str, Any]:
     """Write `config.yaml`, resolved, in the first process; returns the same as plain values."""
     config: dict[str, Any] = OmegaConf.to_container(cfg, resolve=True)  # type: ignore[assignment]
     if is_first_process():
-        (run_dir / layout.CONFIG).write_text(OmegaConf.to_yaml(OmegaConf.create(config)))
+        write_text_atomically(run_dir / layout.CONFIG, OmegaConf.to_yaml(OmegaConf.create(config)))
     return config

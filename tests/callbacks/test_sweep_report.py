@@ -1,3 +1,4 @@
+import atexit
 import json
 
 import pytest
@@ -14,6 +15,7 @@ def end_job(tmp_path):
     """Let a job of a call end; returns the jobs that `sweep.json` then names."""
 
     def end(call, number, run_dir, status=JobStatus.COMPLETED, typed=()):
+        """With no status, the sweep ends in the middle of the job."""
         hydra = {
             "mode": RunMode.MULTIRUN,
             "overrides": {"task": [f"seed={number}", *typed]},
@@ -21,11 +23,19 @@ def end_job(tmp_path):
             "sweep": {"dir": str(tmp_path / "multirun" / call)},
             "job": {"num": number},
         }
-        run = {"seed": number, "paths": {"run_dir": str(tmp_path / "runs" / run_dir)}}
-        config = OmegaConf.create({"hydra": hydra, "preset": {"name": "smoke"}, "tables": ["table_3_4"]})
-        returned = JobReturn(cfg=OmegaConf.create(run), status=status)
-        returned.return_value = ValueError("broken") if status == JobStatus.FAILED else None
-        SweepReport(tmp_path).on_job_end(config, returned)
+        content = {"seed": number, "preset": {"name": "smoke"}, "tables": ["table_3_4"], "logger": None}
+        config = OmegaConf.create({"hydra": hydra, "group": None, **content})
+        report = SweepReport(tmp_path)
+        report.on_job_start(config)
+        if status is None:
+            report.on_multirun_start(config)
+            atexit.unregister(report._sum_up)
+            report._sum_up()
+        else:
+            run = {"paths": {"run_dir": str(tmp_path / "runs" / run_dir)}}
+            returned = JobReturn(cfg=OmegaConf.create(run), status=status)
+            returned.return_value = ValueError("broken") if status == JobStatus.FAILED else None
+            report.on_job_end(config, returned)
         return json.loads((tmp_path / "sweeps" / "table_3_4-smoke" / "sweep.json").read_text())["jobs"]
 
     return end
@@ -69,6 +79,16 @@ def test_a_failure_is_kept_among_the_rows_of_a_later_call_until_it_is_mended(end
 def test_a_failure_with_other_settings_is_forgotten(end_job):
     end_job("first", 0, "a", JobStatus.FAILED, typed=("data.observation.num_points=0",))
     assert len(end_job("second", 0, "b", typed=("data.observation.num_points=64",))) == 1
+
+
+def test_a_sweep_that_ends_in_the_middle_of_a_job_leaves_tables(end_job, tmp_path):
+    [job] = end_job("first", 0, "a", status=None)
+    assert (job["seed"], job["run_dir"], job["status"]) == (0, None, "running")
+    assert "missing" in (tmp_path / "sweeps" / "table_3_4-smoke" / "table.md").read_text()
+    [job] = end_job("second", 0, "a")
+    assert job["status"] == "complete"
+    [job] = end_job("third", 0, "a", status=None)
+    assert job["status"] == "complete", "the earlier result stays until there is another"
 
 
 def test_tables_that_cannot_be_written_end_the_call_as_failed(tmp_path, monkeypatch):

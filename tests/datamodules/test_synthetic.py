@@ -1,5 +1,7 @@
+import errno
 import logging
 import math
+import multiprocessing
 import os
 import resource
 from dataclasses import fields, replace
@@ -106,6 +108,12 @@ def test_a_fixed_set_is_rendered_once_and_shared_by_data_modules_that_want_the_s
         assert "rendering" not in caplog.text
 
 
+def test_rendering_a_fixed_set_draws_no_global_random_numbers(make_datamodule):
+    before = torch.get_rng_state()
+    make_datamodule(num_val=1).setup("validate")
+    assert torch.equal(torch.get_rng_state(), before)
+
+
 def test_the_test_set_is_another_than_the_validation_set(make_datamodule):
     datamodule = make_datamodule(num_val=8, num_test=8)
     datamodule.setup("validate")
@@ -171,6 +179,8 @@ def test_training_batches_are_the_same_bits_with_and_without_a_worker(train_load
         for epoch in (0, 1, 1):  # the worker lives on through the epochs
             for plain, worked in zip(*(batches_of(loader, epoch) for loader in loaders)):
                 assert_same_bits(plain, worked)
+                # A small /dev/shm would fill up, and the batch be lost.
+                assert not any(value.is_shared() for value in worked.values())
     finally:
         torch.set_num_threads(threads)
 
@@ -300,6 +310,18 @@ def test_a_poses_heading_that_was_dropped_cannot_be_kept(make_datamodule):
 def test_training_batches_before_setup_are_an_error(make_datamodule):
     with pytest.raises(RuntimeError, match="has not been called"):
         make_datamodule().train_dataloader()
+
+
+def test_workers_that_the_system_has_no_room_for_are_found_before_anything_is_rendered(
+    make_datamodule, monkeypatch
+):
+    def full():
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(multiprocessing, "Queue", full)
+    with pytest.raises(ValueError, match=r"No space left.*data\.num_workers=0.*docker run --shm-size"):
+        make_datamodule(num_workers=2).setup("fit")
+    make_datamodule(num_val=1).setup("fit")
 
 
 # Memory

@@ -1,13 +1,17 @@
+import errno
 import json
+import logging
 import signal
 import subprocess
 import sys
 import threading
 import time
+from pathlib import Path
 
 import pytest
 
-from ljn.runs.files import read_json, write_json
+from ljn.runs.files import path_part, read_json, write_json
+from ljn.runs.processes import Interruption
 from ljn.runs.record import RunRecord, alone_in, is_complete
 
 
@@ -34,7 +38,7 @@ def test_a_record_says_running_then_complete(tmp_path):
     ("error", "status"),
     [
         (KeyboardInterrupt(), "interrupted"),
-        (SystemExit(1), "interrupted"),
+        (Interruption(signal.SIGTERM), "interrupted"),
         (RuntimeError("broken"), "failed"),
     ],
 )
@@ -55,14 +59,69 @@ def test_a_second_attempt_is_counted_and_its_time_added(tmp_path):
     assert record["wall_time_s"] >= 100
 
 
-def test_a_killed_process_leaves_a_valid_record_that_says_running(tmp_path):
+@pytest.mark.parametrize(
+    ("number", "returncode", "status"),
+    [
+        (signal.SIGKILL, -signal.SIGKILL, "running"),
+        (signal.SIGTERM, 143, "interrupted"),
+        (signal.SIGINT, 130, "interrupted"),
+    ],
+)
+def test_a_signal_leaves_a_valid_record_and_the_exit_code_that_shells_expect(
+    tmp_path, number, returncode, status
+):
     code = (
-        "import os, signal, sys; from pathlib import Path; from ljn.runs.record import RunRecord\n"
-        "with RunRecord(Path(sys.argv[1]), {}): os.kill(os.getpid(), signal.SIGKILL)"
+        "import os, sys; from pathlib import Path\n"
+        "from ljn.runs.processes import end_on_signals; from ljn.runs.record import RunRecord\n"
+        "end_on_signals()\n"
+        "with RunRecord(Path(sys.argv[1]), {}):\n"
+        "    try: os.kill(os.getpid(), int(sys.argv[2]))\n"
+        "    finally: os.kill(os.getpid(), int(sys.argv[2]))"  # a second one does not disturb the end
     )
-    done = subprocess.run([sys.executable, "-c", code, str(tmp_path)], timeout=60)
-    assert done.returncode == -signal.SIGKILL
-    assert read_json(tmp_path / "record.json")["status"] == "running"
+    done = subprocess.run([sys.executable, "-c", code, str(tmp_path), str(int(number))], timeout=60)
+    assert done.returncode == returncode
+    assert read_json(tmp_path / "record.json")["status"] == status
+
+
+def test_a_full_disk_leaves_the_old_file_no_draft_and_the_first_error(tmp_path, monkeypatch, caplog):
+    write = Path.write_text
+
+    def half(path, text, **options):
+        write(path, text[: len(text) // 2], **options)
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    write_json(tmp_path / "metrics.json", {"a": 1})
+    record = RunRecord(tmp_path, {}).__enter__()
+    monkeypatch.setattr(Path, "write_text", half)
+    for write_something in (lambda: write_json(tmp_path / "metrics.json", {"a": 2}), record.__enter__):
+        with pytest.raises(OSError, match="No space left"):
+            write_something()
+    error = RuntimeError("broken")
+    with caplog.at_level(logging.WARNING):
+        record.__exit__(RuntimeError, error, None)  # does not raise
+    assert "No space left on device" in caplog.text
+    assert read_json(tmp_path / "metrics.json") == {"a": 1}
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["metrics.json", "record.json"]
+
+
+@pytest.mark.parametrize(
+    ("text", "part"),
+    [
+        ("detector/proposed", "detector-proposed"),
+        ("v1.0, two words", "v1.0, two words"),
+        ("../../up", "--..-up"),
+        ("/absolute", "-absolute"),
+        (r"C:\up", "C:-up"),
+        ("..", "-"),
+        (".hidden", "-hidden"),
+        ("", "-"),
+        ("zero\0, line\n", "zero-, line-"),
+        ("x" * 300, "x" * 100),
+    ],
+)
+def test_no_name_leads_to_another_directory(text, part, tmp_path):
+    assert path_part(text) == part
+    assert (tmp_path / part).resolve().parent == tmp_path.resolve()
 
 
 def test_json_holds_no_nan_and_no_half_written_file(tmp_path):

@@ -60,6 +60,7 @@ def test_all_else_is_left_alone():
 
 
 def test_a_key_that_has_moved_is_named(run_py):
-    done = run_py("task=predict", "input=depth.png", check=False)
+    done = run_py("input=depth.png", check=False)
     assert done.returncode == 1
-    assert done.stderr == "error: input: it is a key of the task; write task=predict task.input=depth.png\n"
+    assert done.stderr == "error: input: only task=predict reads this; add task=predict, or leave it out\n"
+    assert prepare_arguments(["task=predict", "input=a=b.png"]) == ["task=predict", "task.input='a=b.png'"]

@@ -67,7 +67,9 @@ def test_a_data_module_gives_each_process_its_part(make_datamodule):
     seen = {split: [] for split in ("train", "val", "test")}
     for number in range(2):
         datamodule = make_datamodule(num_train=19, num_val=5, num_test=7, batch_size=4)
-        datamodule.trainer = SimpleNamespace(global_rank=number, world_size=2)
+        progress = SimpleNamespace(current=SimpleNamespace(processed=0))
+        fit_loop = SimpleNamespace(epoch_progress=progress)
+        datamodule.trainer = SimpleNamespace(global_rank=number, world_size=2, fit_loop=fit_loop)
         datamodule.setup("fit")
         datamodule.setup("test")
         for split, loader in (

@@ -88,14 +88,23 @@ def test_a_killed_sweep_is_finished_by_the_same_command_with_the_same_table(tmp_
     whole = run_sweep(tmp_path / "whole", "seed=0,1")
     assert whole.wait(timeout=300) == 0
 
-    killed = run_sweep(tmp_path / "killed", "seed=0,1")
-    for _ in range(3000):
-        started = list((tmp_path / "killed" / "runs").glob("*/record.json"))
-        if len(started) == 3 or killed.poll() is not None:
-            break
-        time.sleep(0.1)
-    killed.send_signal(signal.SIGKILL)
-    killed.communicate(timeout=60)
+    def end(number, num_started):
+        """Start the sweep, and send it a signal while it is at the run of this number; the runs that it has begun."""
+        sweep = run_sweep(tmp_path / "killed", "seed=0,1")
+        started = []
+        while len(started) < num_started and sweep.poll() is None:
+            started = list((tmp_path / "killed" / "runs").glob("*/record.json"))
+            time.sleep(0.1)
+        sweep.send_signal(number)
+        output = sweep.communicate(timeout=60)[0]
+        return started, sweep.returncode, output
+
+    started, returncode, output = end(signal.SIGTERM, 1)
+    assert returncode == 143, output
+    assert [read_json(path)["status"] for path in started] == ["interrupted"]
+    page = tmp_path / "killed" / "sweeps" / "table_3_4-smoke" / "report.html"
+    assert "missing" in page.read_text()
+    started, *_ = end(signal.SIGKILL, 3)
     complete = [path for path in started if read_json(path)["status"] == "complete"]
     assert len(started) == 3
     assert len(complete) == 2

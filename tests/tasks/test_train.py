@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import time
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -13,8 +14,11 @@ import torch
 from lightning.pytorch import Callback
 from omegaconf import OmegaConf
 
+from datamodules.batches import EpochSampler
+from ljn.runs.files import read_json
 from ljn.tasks import running
 from ljn.tasks import train as train_task
+from ljn.tasks.running import set_run_directory
 from ljn.tasks.train import train
 
 ROOT = Path(__file__).parents[2]
@@ -110,17 +114,39 @@ class Stop(Callback):
             raise RuntimeError("power cut")
 
 
-@pytest.mark.parametrize("epoch", [1, 3])
-def test_a_resumed_run_equals_an_uninterrupted_one(smoke_config, tmp_path, monkeypatch, epoch):
-    overrides = (
-        "experiment=detector/proposed",
-        "trainer.max_epochs=4",
-        "preset.scheduler.step_size=1",
-        "preset.scheduler.gamma=0.5",
-    )
-    whole = smoke_config(tmp_path / "whole", *overrides)
-    metrics = train(whole)
+RESUMED = (
+    "trainer.max_epochs=3",
+    "preset.scheduler.step_size=1",
+    "preset.scheduler.gamma=0.5",
+    "callbacks.pictures=null",
+)
 
+
+@pytest.fixture(scope="module")
+def uninterrupted(smoke_config, tmp_path_factory):
+    """Metrics and weights of an experiment's run without workers, trained once."""
+
+    @cache
+    def run(experiment):
+        cfg = smoke_config(tmp_path_factory.mktemp("whole"), f"experiment={experiment}", *RESUMED)
+        return train(cfg), weights(Path(cfg.paths.run_dir))
+
+    return run
+
+
+@pytest.mark.parametrize(
+    ("experiment", "epoch", "num_workers"),
+    [
+        ("detector/proposed", 2, 0),
+        ("detector/proposed", 1, 1),
+        ("detector/proposed", 2, 2),
+        ("detector/simple_baseline", 2, 1),  # with dropout
+    ],
+)
+def test_a_resumed_run_equals_an_uninterrupted_one(
+    uninterrupted, smoke_config, tmp_path, monkeypatch, experiment, epoch, num_workers
+):
+    cfg = smoke_config(tmp_path, f"experiment={experiment}", *RESUMED, f"data.num_workers={num_workers}")
     original = running.build_each
     with monkeypatch.context() as patch:
         patch.setattr(
@@ -128,18 +154,40 @@ def test_a_resumed_run_equals_an_uninterrupted_one(smoke_config, tmp_path, monke
             "build_each",
             lambda node: [*original(node), *([Stop(epoch)] if "best" in node else [])],
         )
-        broken = smoke_config(tmp_path / "broken", *overrides)
         with pytest.raises(RuntimeError, match="power cut"):
-            train(broken)
-    run_dir = Path(broken.paths.run_dir)
+            train(cfg)
+    run_dir = Path(cfg.paths.run_dir)
     assert json.loads((run_dir / "record.json").read_text())["status"] == "failed"
 
-    resumed = smoke_config(tmp_path / "broken", *overrides)
-    assert train(resumed) == metrics
-    ours, theirs = weights(Path(whole.paths.run_dir)), weights(run_dir)
+    metrics, theirs = uninterrupted(experiment)
+    assert train(cfg) == metrics
+    ours = weights(run_dir)
     assert all(torch.equal(ours[name], theirs[name]) for name in ours)
     record = json.loads((run_dir / "record.json").read_text())
     assert (record["status"], record["attempts"]) == ("complete", 2)
+
+
+class Seen(Callback):
+    """Keeps the samples of every step."""
+
+    def __init__(self):
+        self.samples = []
+
+    def on_train_batch_end(self, trainer, pl_module, outputs, batch, batch_idx):
+        self.samples.append((trainer.current_epoch, batch["sample_id"].tolist()))
+
+
+def test_every_epoch_shows_its_own_samples_in_its_own_order(smoke_config, tmp_path, monkeypatch):
+    seen, original = Seen(), train_task.build_each
+    monkeypatch.setattr(
+        train_task, "build_each", lambda node: [*original(node), *([seen] if "best" in node else [])]
+    )
+    train(smoke_config(tmp_path, "experiment=detector/basic", *RESUMED, "data.num_workers=2"))
+    expected = []
+    for epoch in range(3):
+        order = [index for _, index in EpochSampler(32, seed=0, epoch=epoch)]
+        expected += [(epoch, order[start : start + 8]) for start in range(0, 32, 8)]
+    assert seen.samples == expected
 
 
 @pytest.mark.parametrize("name", ["mean_offset", "ridge"])
@@ -186,6 +234,11 @@ def test_a_damaged_checkpoint_to_resume_from_is_named(smoke_config, tmp_path):
     (run_dir / "checkpoints" / "last.ckpt").write_bytes(b"half a")
     with pytest.raises(ValueError, match=r"last\.ckpt' is damaged"):
         train(cfg)
+
+
+def test_names_from_a_configuration_lead_to_no_other_directory(smoke_config, tmp_path):
+    cfg = smoke_config(tmp_path, "name=../../up", "preset.name='../up'")
+    assert set_run_directory(cfg, "runs", "hash") == tmp_path / "runs" / "--..-up---up-hash"
 
 
 def test_another_content_of_the_pose_file_is_another_run(smoke_config, tmp_path):
@@ -244,50 +297,76 @@ def wait_for(condition, process, seconds=120):
         time.sleep(0.05)
 
 
-def test_ctrl_c_leaves_a_valid_record_and_a_killed_run_resumes(tmp_path):
-    command = [
-        *(sys.executable, "run.py", "experiment=detector/basic", "preset=smoke", "logger=csv"),
-        *(
-            f"paths.output_dir={tmp_path}",
-            "callbacks.pictures=null",
-            "trainer.max_epochs=400",
-            "preset.num_val=1",
-        ),
-    ]
-    environment = os.environ | {"OMP_NUM_THREADS": "1"}
+def start(directory, *overrides):
+    return subprocess.Popen(
+        [sys.executable, "run.py", "preset=smoke", "logger=csv", f"paths.output_dir={directory}", *overrides],
+        cwd=ROOT,
+        env=os.environ | {"OMP_NUM_THREADS": "1"},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        start_new_session=True,  # a group, which a signal ends with its workers
+    )
 
-    def start():
-        return subprocess.Popen(
-            command, cwd=ROOT, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT
-        )
 
-    def record():
-        [path] = tmp_path.glob("runs/*/record.json")
-        return json.loads(path.read_text())
+def test_sigterm_and_ctrl_c_are_said_and_recorded_and_the_run_goes_on(tmp_path):
+    overrides = (
+        "experiment=detector/basic",
+        "trainer.max_epochs=400",
+        "callbacks.pictures=null",
+        "preset.num_val=1",
+    )
 
     def written():
         return next((path.stat().st_mtime_ns for path in tmp_path.glob("runs/*/checkpoints/last.ckpt")), 0)
 
-    first = start()
-    wait_for(written, first)
-    first.send_signal(signal.SIGINT)
-    assert first.wait(60) != 0
-    assert record()["status"] == "interrupted"
-
-    before = written()
-    second = start()
-    wait_for(lambda: written() > before, second)
-    second.kill()
-    second.wait(60)
-    assert record()["status"] == "running"
-
-    [path] = tmp_path.glob("runs/*/checkpoints/last.ckpt")
-    epoch = torch.load(path, weights_only=True)["epoch"]
-    third = start()
-    before = written()
-    wait_for(lambda: written() > before, third)
-    third.kill()
-    output = third.communicate(timeout=60)[0].decode()
+    for number, returncode in ((signal.SIGTERM, 143), (signal.SIGINT, 130)):
+        before = written()
+        process = start(tmp_path, *overrides)
+        wait_for(lambda before=before: written() > before, process)
+        process.send_signal(number)
+        output = process.communicate(timeout=60)[0]
+        assert process.returncode == returncode
+        assert f"ended by {number.name}: a training is resumed by the same command" in output
+        assert "Traceback" not in output
+        [record] = tmp_path.glob("runs/*/record.json")
+        assert json.loads(record.read_text())["status"] == "interrupted"
+        if number == signal.SIGTERM:
+            [path] = tmp_path.glob("runs/*/checkpoints/last.ckpt")
+            epoch = torch.load(path, weights_only=True)["epoch"]
     assert "resuming from" in output
     assert f"epoch {epoch + 2}/400" in output
     assert f"epoch {epoch}/400" not in output
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("experiment", "num_workers"), [("detector/proposed", 1), ("mesh/proposed", 2)])
+def test_a_run_killed_at_five_random_moments_equals_an_uninterrupted_one(tmp_path, experiment, num_workers):
+    overrides = (f"experiment={experiment}", "trainer.max_epochs=12", f"data.num_workers={num_workers}")
+    results = {}
+    for name, num_kills in (("killed", 5), ("whole", 0)):
+        directory = tmp_path / name
+        moments = np.random.default_rng(num_workers).uniform(0, 4, num_kills)
+        for attempt, moment in enumerate(moments, 1):
+            process = start(directory, *overrides)
+
+            def has_begun(directory=directory, attempt=attempt):
+                records = [read_json(path) for path in directory.glob("runs/*/record.json")]
+                return any(record and record["attempts"] == attempt for record in records)
+
+            wait_for(has_begun, process)
+            time.sleep(moment)
+            assert process.poll() is None, "it ended before it was killed; train for more epochs"
+            os.killpg(process.pid, signal.SIGKILL)
+            process.communicate(timeout=60)
+        process = start(directory, *overrides)
+        output = process.communicate(timeout=300)[0]
+        assert process.returncode == 0, output
+        [run_dir] = directory.glob("runs/*")
+        assert read_json(run_dir / "record.json")["attempts"] == num_kills + 1
+        with np.load(run_dir / "test_errors.npz") as errors:
+            results[name] = (read_json(run_dir / "metrics.json"), weights(run_dir), dict(errors))
+    (metrics, ours, errors), (expected_metrics, theirs, expected_errors) = results.values()
+    assert metrics == expected_metrics
+    assert all(torch.equal(ours[name], theirs[name]) for name in theirs)
+    assert all(np.array_equal(errors[name], expected_errors[name]) for name in expected_errors)
