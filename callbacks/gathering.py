@@ -8,7 +8,7 @@ from torch import Tensor
 def gather_samples(batches: list[dict[str, Tensor]]) -> dict[str, Tensor]:
     """What every process has kept of its batches, joined and in the order of `sample_id`.
 
-    All processes have to call it. The order of the samples does not hang on how they were shared out.
+    All processes have to call it. The order of the samples does not depend on how they were shared out.
 
     Args:
         batches: What this process kept, on the CPU: rows of samples, `sample_id` `(B,)` among them.

@@ -20,7 +20,7 @@ from datamodules.synthesis import SAMPLES_VERSION, DepthSynthesizer, SynthesisSe
 from ljn.body import BodyModel, load_body_models
 from ljn.cloud.normals import get_normal_estimator
 from ljn.cloud.observation import ObservationRecipe
-from ljn.data import SPLITS, Batch, BodyDataModule
+from ljn.data import SPLITS, Batch, DataModule
 from ljn.geometry.camera import Camera
 from ljn.modules.joint_detector import JointDetector
 from ljn.render import get_renderer
@@ -30,7 +30,7 @@ _LOG = logging.getLogger(__name__)
 _CHUNK = 16
 
 
-class SyntheticDepthDataModule(BodyDataModule):
+class SyntheticDepthDataModule(DataModule):
     """Bodies from a pose source, seen by a depth camera.
 
     Training samples are made in worker processes, anew in every epoch; a sample depends on the seed, the epoch
@@ -114,12 +114,12 @@ class SyntheticDepthDataModule(BodyDataModule):
 
     @property
     def recipe(self) -> ObservationRecipe:
-        """See `BodyDataModule`."""
+        """See `DataModule`."""
         return replace(self.observation, spacing_m=self.synthesis.distance_m[0] / self.camera.fx)
 
     @property
     def fingerprint(self) -> str:
-        """See `BodyDataModule`."""
+        """See `DataModule`."""
         if self._detector_checkpoint is None:
             return self._samples_fingerprint
         made_of = f"{self._samples_fingerprint} {self._detector_checkpoint[1].file_hash}"
@@ -128,16 +128,17 @@ class SyntheticDepthDataModule(BodyDataModule):
     @property
     def _samples_fingerprint(self) -> str:
         """Hash of what samples are made of before a detector sees them."""
-        made_of = f"{SAMPLES_VERSION} {self.body_hash} {self.source.name} {self.source.fingerprint}"
+        bodies = sorted(body.hash for body in self.bodies)
+        made_of = f"{SAMPLES_VERSION} {bodies} {self.source.name} {self.source.fingerprint}"
         return hashlib.sha256(made_of.encode()).hexdigest()[:16]
 
     @property
     def licence(self) -> str:
-        """The source's licence; see `BodyDataModule`."""
+        """The source's licence; see `DataModule`."""
         return self.source.licence
 
     def examples(self, split: str, indices: Sequence[int]) -> tuple[Batch, Tensor]:
-        """See `BodyDataModule`."""
+        """See `DataModule`."""
         if not all(0 <= index < self.sizes[split] for index in indices):
             raise ValueError(
                 f"examples: the {split} set has {self.sizes[split]} samples, got {list(indices)}; ask for fewer, or "
@@ -147,7 +148,7 @@ class SyntheticDepthDataModule(BodyDataModule):
         return self.on_after_batch_transfer(batch, 0), depth
 
     def describe(self, splits: Sequence[str] = SPLITS) -> dict[str, Any]:
-        """See `BodyDataModule`."""
+        """See `DataModule`."""
         return {
             "source": self.source.name,
             "version": SAMPLES_VERSION,

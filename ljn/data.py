@@ -45,7 +45,7 @@ class Batch(TypedDict, total=False):
     sample_id: Tensor
 
 
-class BodyDataModule(LightningDataModule):
+class DataModule(LightningDataModule):
     """Base of the data modules: what tasks ask of one beside its loaders.
 
     Attributes:
@@ -63,11 +63,6 @@ class BodyDataModule(LightningDataModule):
     def recipe(self) -> ObservationRecipe | None:
         """How its observations are made, and what was trained with them: goes into checkpoints."""
         return None
-
-    @property
-    def body_hash(self) -> str:
-        """The bodies' sorted hashes, joined by "-": see `SMPL.hash`; empty without bodies."""
-        return "-".join(sorted(body.hash for body in self.bodies))
 
     @property
     @abstractmethod

@@ -24,6 +24,8 @@ class SampleMetric(Metric):
 
     is_differentiable = False
     full_state_update = False
+    reduce: ClassVar[Any]
+    """What becomes of several values of a sample: a function of a tensor and a dimension."""
 
     def __init__(self, unit: str, goal: Goal | None = "min") -> None:
         super().__init__()
@@ -35,18 +37,15 @@ class SampleMetric(Metric):
         """The goal as torchmetrics states it."""
         return None if self.goal is None else self.goal == "max"
 
-    def update(self, values: Tensor) -> None:
-        """Add a batch: `(B, ...)`, float64."""
-        raise NotImplementedError
-
     def each(self, values: Tensor) -> Tensor:
         """What a batch's samples, `(B, ...)`, come to one by one: `(B,)`."""
-        raise NotImplementedError
+        return values if values.ndim == 1 else type(self).reduce(values.flatten(1), 1)
 
 
 class SampleMean(SampleMetric):
     """Mean of all values of all samples; see `SampleMetric`."""
 
+    reduce = staticmethod(torch.mean)
     total: Tensor
     count: Tensor
 
@@ -56,7 +55,7 @@ class SampleMean(SampleMetric):
         self.add_state("count", torch.zeros((), dtype=torch.int64), dist_reduce_fx="sum")
 
     def update(self, values: Tensor) -> None:
-        """See `SampleMetric.update`."""
+        """Add a batch: `(B, ...)`, float64."""
         # Out of place: a state that a half-precision trainer has cast is float64 again after this.
         self.total = self.total + values.sum()
         self.count = self.count + values.numel()
@@ -65,14 +64,11 @@ class SampleMean(SampleMetric):
         """Return the mean, a float64 scalar."""
         return self.total / self.count
 
-    def each(self, values: Tensor) -> Tensor:
-        """See `SampleMetric.each`."""
-        return values if values.ndim == 1 else values.flatten(1).mean(1)
-
 
 class SampleMax(SampleMetric):
     """Maximum of all values of all samples, NaN after any NaN; see `SampleMetric`."""
 
+    reduce = staticmethod(torch.amax)
     maximum: Tensor
 
     def __init__(self, unit: str, goal: Goal | None = "min") -> None:
@@ -80,16 +76,12 @@ class SampleMax(SampleMetric):
         self.add_state("maximum", torch.tensor(-torch.inf, dtype=torch.float64), dist_reduce_fx="max")
 
     def update(self, values: Tensor) -> None:
-        """See `SampleMetric.update`."""
+        """Add a batch: `(B, ...)`, float64."""
         self.maximum = torch.cat([self.maximum[None], values.flatten()]).max()
 
     def compute(self) -> Tensor:
         """Return the maximum, a float64 scalar."""
         return self.maximum.where(~self.maximum.isneginf(), torch.nan)
-
-    def each(self, values: Tensor) -> Tensor:
-        """See `SampleMetric.each`."""
-        return values if values.ndim == 1 else values.flatten(1).amax(1)
 
 
 @dataclass(frozen=True)

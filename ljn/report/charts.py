@@ -16,7 +16,7 @@ class Series:
 
     Attributes:
         label: What it is called.
-        points: x, y and half the length of y's error bar (None for none), by rising x.
+        points: x, y and half the length of y's error bar (None for none).
         colour: Number of its colour.
         is_dashed: Whether it is dashed and its markers are hollow.
         has_markers: Whether its points are marked.
@@ -27,6 +27,11 @@ class Series:
     colour: int = 0
     is_dashed: bool = False
     has_markers: bool = True
+
+    @property
+    def style(self) -> str:
+        """Its classes in the style sheet."""
+        return f"line c{self.colour % NUM_COLOURS}{' dashed' if self.is_dashed else ''}"
 
 
 def line_chart(series: Sequence[Series], title: str, x_label: str, y_label: str) -> str:
@@ -40,7 +45,8 @@ def line_chart(series: Sequence[Series], title: str, x_label: str, y_label: str)
     """
     shown = []
     for line in series:
-        points = tuple(point for point in line.points if math.isfinite(point[0]) and math.isfinite(point[1]))
+        finite = (point for point in line.points if math.isfinite(point[0]) and math.isfinite(point[1]))
+        points = sorted(finite, key=lambda point: point[0])
         if points:
             shown.append((line, points))
     if not shown:
@@ -97,7 +103,6 @@ def _draw(
     points: Sequence[tuple[float, float, float | None]],
     down: Callable[[float], float],
 ) -> str:
-    style = f"line c{line.colour % NUM_COLOURS}{' dashed' if line.is_dashed else ''}"
     parts = []
     if len(places) > 1:
         route = "L".join(f"{x:.1f} {y:.1f}" for x, y in places)
@@ -108,16 +113,15 @@ def _draw(
             bar = f"M{x:.1f} {top:.1f}V{bottom:.1f}M{x - 4:.1f} {top:.1f}h8M{x - 4:.1f} {bottom:.1f}h8"
             parts.append(f'<path class="bar" d="{bar}"/>')
         if line.has_markers or len(places) == 1:
-            said = f"{line.label}, {value:.6g}: {height:.1f}" + (f" ± {error:.1f}" if error else "")
-            parts.append(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="4"><title>{escape(said)}</title></circle>')
-    return f'<g class="{style}">{"".join(parts)}</g>'
+            words = f"{line.label}, {value:.6g}: {height:.1f}" + (f" ± {error:.1f}" if error else "")
+            parts.append(f'<circle cx="{x:.1f}" cy="{y:.1f}" r="4"><title>{escape(words)}</title></circle>')
+    return f'<g class="{line.style}">{"".join(parts)}</g>'
 
 
 def _swatch(line: Series) -> str:
-    style = f"line c{line.colour % NUM_COLOURS}{' dashed' if line.is_dashed else ''}"
     marker = '<circle cx="13" cy="6" r="3.5"/>' if line.has_markers else ""
     return (
-        f'<svg class="swatch" viewBox="0 0 26 12" aria-hidden="true"><g class="{style}">'
+        f'<svg class="swatch" viewBox="0 0 26 12" aria-hidden="true"><g class="{line.style}">'
         f'<path class="route" d="M1 6H25"/>{marker}</g></svg>'
     )
 

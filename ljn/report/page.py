@@ -2,7 +2,6 @@
 
 from collections.abc import Iterable, Sequence
 from html import escape
-from typing import Any
 
 from ljn.report import markup, sections, writers
 from ljn.report.charts import Series, line_chart
@@ -168,23 +167,17 @@ def _axis_charts(table: TableResult) -> str:
         return ""
     charts = []
     for number, shown in enumerate(table.table.columns):
-        cells = [(row, row.cells[number]) for row in table.rows]
-        ours = [(row.x, entry.mean, entry.sd) for row, entry in cells if None not in (row.x, entry.mean)]
-        thesis = [
-            (row.row.x, entry.thesis, None) for row, entry in cells if None not in (row.row.x, entry.thesis)
-        ]
-        if shown.goal is None or not ours:
-            continue
-        series = [
-            Series("ours", _by_x(ours), 0),
-            Series("thesis", _by_x(thesis), 1, is_dashed=True),
-        ]
-        charts.append(line_chart(series, f"{shown.label} by {axis.label}", axis.label, shown.heading))
+        ours, thesis = [], []
+        for row in table.rows:
+            cell = row.cells[number]
+            if row.x is not None and cell.mean is not None:
+                ours.append((row.x, cell.mean, cell.sd))
+            if row.row.x is not None and cell.thesis is not None:
+                thesis.append((row.row.x, cell.thesis, None))
+        if shown.goal and ours:
+            series = [Series("ours", tuple(ours), 0), Series("thesis", tuple(thesis), 1, is_dashed=True)]
+            charts.append(line_chart(series, f"{shown.label} by {axis.label}", axis.label, shown.heading))
     return "".join(charts)
-
-
-def _by_x(points: list[Any]) -> tuple[tuple[float, float, float | None], ...]:
-    return tuple(sorted(points, key=lambda point: point[0]))
 
 
 def _training_chart(table: TableResult) -> str:

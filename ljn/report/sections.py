@@ -18,6 +18,7 @@ from ljn.report.writers import NONE
 from ljn.runs.sweep import Run, mapping
 
 _MAX_PICTURE_PX = 1600
+_PICTURE_ERRORS: tuple[type[Exception], ...] = (*READ_ERRORS, Image.DecompressionBombError)
 _SPLITS = {"train": "train", "val": "validation", "test": "test"}
 _COUNTS_NOTE = (
     "Thesis: Table 3.1, SURREAL and the samples taken of it; its validation set is a part of its test set. Ours: the "
@@ -101,11 +102,10 @@ def pictures(results: Results) -> str:
 
 def embed(path: Path) -> str | None:
     """A picture as a data URI, at most 1,600 pixels wide; None, with a warning, for a damaged one."""
-    unreadable: tuple[type[Exception], ...] = (Image.DecompressionBombError, *READ_ERRORS)
     try:
         with Image.open(path, formats=("PNG",)) as opened:
             image = opened.convert("RGB")
-    except unreadable as error:
+    except _PICTURE_ERRORS as error:
         warnings.warn(f"'{path}' is left out of the report: {error}", stacklevel=2)
         return None
     if image.width > _MAX_PICTURE_PX:
@@ -168,14 +168,10 @@ def _commit(record: Mapping[str, Any]) -> str:
 def _data(run: Run) -> str:
     if not run.data:
         return MISSING
-    version = run.data.get("version")
-    detector = mapping(run.data.get("detector")).get("hash")
-    parts = [
-        f"{text(run.data.get('source'))} v{escape(str(version))}"
-        if version is not None
-        else text(run.data.get("source")),
-        mono(run.data.get("fingerprint")),
-    ]
+    version, detector = run.data.get("version"), mapping(run.data.get("detector")).get("hash")
+    parts = [text(run.data.get("source")), mono(run.data.get("fingerprint"))]
+    if version is not None:
+        parts[0] += f" v{escape(str(version))}"
     if detector:
         parts.append(f"joints of {mono(detector)}")
     return "<br>".join(parts)

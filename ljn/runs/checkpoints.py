@@ -27,7 +27,7 @@ class Provenance(Callback):
 
     Args:
         config: The resolved configuration, plain values.
-        body_hash: See `BodyDataModule.body_hash`.
+        body_hash: Hashes of the bodies of data and model, joined by "-"; empty without bodies.
         data_licence: What is to be said of the data's licence.
         run: Name of the run's directory.
         recipe: How the observations that it was trained on were made; None where there were none.

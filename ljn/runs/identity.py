@@ -22,7 +22,7 @@ def identity(cfg: DictConfig, data_fingerprint: str) -> dict[str, Any]:
 
     Args:
         cfg: The composed configuration.
-        data_fingerprint: Of what the data's files hold, which their names do not say; see `BodyDataModule`.
+        data_fingerprint: Of what the data's files hold, which their names do not say; see `DataModule`.
     """
     cfg = cfg.copy()
     with open_dict(cfg):

@@ -7,7 +7,7 @@ import torch
 from omegaconf import DictConfig
 
 from ljn.building import build
-from ljn.data import BodyDataModule
+from ljn.data import DataModule
 from ljn.runs import layout
 from ljn.runs.checkpoints import Checkpoint, load_state, read_checkpoint
 from ljn.runs.files import read_metrics, write_json
@@ -59,7 +59,7 @@ def evaluate_checkpoint(
     cfg.name = name or cfg.name
     validate(cfg)
 
-    datamodule: BodyDataModule = build(cfg.data)
+    datamodule: DataModule = build(cfg.data)
     datamodule.prepare_data()
     evaluated = {**identity(cfg, datamodule.fingerprint), "checkpoint": checkpoint.file_hash}
     identity_hash = config_hash(evaluated)
@@ -73,7 +73,7 @@ def evaluate_checkpoint(
 
 
 def _evaluate(
-    cfg: DictConfig, datamodule: BodyDataModule, checkpoint: Checkpoint, run_dir: Path, identity_hash: str
+    cfg: DictConfig, datamodule: DataModule, checkpoint: Checkpoint, run_dir: Path, identity_hash: str
 ) -> dict[str, float]:
     prepare_process(cfg)
     module = build(cfg.module)

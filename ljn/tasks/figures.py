@@ -10,7 +10,7 @@ from omegaconf import DictConfig
 
 from ljn.body.skeleton import ROOT
 from ljn.building import build
-from ljn.data import Batch, BodyDataModule
+from ljn.data import Batch, DataModule
 from ljn.drawing import MeshSample, Sample, draw_meshes, draw_samples
 from ljn.metrics import mpjpe
 from ljn.modules.joint_detector import JointDetector
@@ -111,7 +111,7 @@ def _column(cfg: DictConfig, path: str, kind: type, key: str, overrides: Sequenc
     own = with_checkpoint_config(cfg, checkpoint, [*typed_overrides(), *overrides])
     validate(own)
     prepare_process(own)
-    datamodule: BodyDataModule = build(own.data)
+    datamodule: DataModule = build(own.data)
     datamodule.takes = (*module.takes, "points")
     datamodule.prepare_data()
     check_bodies(checkpoint, {body.hash for body in datamodule.bodies} | set(module.body_hashes))

@@ -12,7 +12,7 @@ import torch
 from omegaconf import DictConfig, OmegaConf, open_dict
 
 from ljn.building import build, build_each
-from ljn.data import BodyDataModule
+from ljn.data import DataModule
 from ljn.modules.base import StageModule
 from ljn.runs import layout
 from ljn.runs.checkpoints import AtomicCheckpointIO, Provenance
@@ -62,10 +62,10 @@ def _num_cores() -> int:
 
 
 def build_trainer(
-    cfg: DictConfig, run_dir: Path, config: dict[str, Any], datamodule: BodyDataModule, module: StageModule
+    cfg: DictConfig, run_dir: Path, config: dict[str, Any], datamodule: DataModule, module: StageModule
 ) -> lightning.Trainer:
     """The trainer with its callbacks and loggers, writing below the run's directory."""
-    body_hashes = {*datamodule.body_hash.split("-"), *module.body_hashes}
+    body_hashes = {body.hash for body in datamodule.bodies} | set(module.body_hashes)
     provenance = Provenance(
         config, "-".join(sorted(body_hashes)), datamodule.licence, run_dir.name, datamodule.recipe
     )

@@ -6,7 +6,7 @@ from pathlib import Path
 from omegaconf import DictConfig
 
 from ljn.building import build
-from ljn.data import BodyDataModule
+from ljn.data import DataModule
 from ljn.drawing import draw_examples
 from ljn.tasks.running import prepare_process
 from ljn.tasks.validation import validate
@@ -29,7 +29,7 @@ def show(cfg: DictConfig) -> dict[str, float]:
     """
     validate(cfg)
     prepare_process(cfg)
-    datamodule: BodyDataModule = build(cfg.data)
+    datamodule: DataModule = build(cfg.data)
     datamodule.prepare_data()
     batch, depth = datamodule.examples("train", range(cfg.task.num_samples))
     path = Path(cfg.paths.output_dir) / "show.png"

@@ -7,7 +7,7 @@ import torch
 from omegaconf import DictConfig
 
 from ljn.building import build
-from ljn.data import BodyDataModule
+from ljn.data import DataModule
 from ljn.runs import layout
 from ljn.runs.checkpoints import read_checkpoint
 from ljn.runs.files import read_metrics, write_json
@@ -40,7 +40,7 @@ def train(cfg: DictConfig) -> dict[str, float]:
             "ckpt_path: it is what task=evaluate reads; a training resumes from its own directory by itself"
         )
     validate(cfg)
-    datamodule: BodyDataModule = build(cfg.data)
+    datamodule: DataModule = build(cfg.data)
     datamodule.prepare_data()
     identity_hash = config_hash(identity(cfg, datamodule.fingerprint))
     run_dir = set_run_directory(cfg, "runs", identity_hash)
@@ -51,9 +51,7 @@ def train(cfg: DictConfig) -> dict[str, float]:
         return _train(cfg, datamodule, run_dir, identity_hash)
 
 
-def _train(
-    cfg: DictConfig, datamodule: BodyDataModule, run_dir: Path, identity_hash: str
-) -> dict[str, float]:
+def _train(cfg: DictConfig, datamodule: DataModule, run_dir: Path, identity_hash: str) -> dict[str, float]:
     prepare_process(cfg)
     module = build(cfg.module)
     datamodule.takes = module.takes

@@ -35,10 +35,14 @@ class KeypointMetrics(StageMetrics):
     headline = ("pck", "distance")
 
 
+class KeypointNet(nn.Sequential):
+    takes = ("image",)
+
+
 class KeypointStage(StageModule):
     stage = "keypoints"
     metrics = KeypointMetrics
-    takes = nn.Sequential
+    net_type = nn.Sequential
     truth = ("true_keypoints",)
     stored = ("pred_keypoints",)
 
@@ -50,7 +54,7 @@ class KeypointStage(StageModule):
         return {"pred_keypoints": pred, **metrics.update(pred=pred, true=batch["true_keypoints"])}
 
     def predict(self, batch):
-        return self.net(batch["image"]).view(-1, NUM_KEYPOINTS, 2)
+        return self(batch).view(-1, NUM_KEYPOINTS, 2)
 
 
 class Images(lightning.LightningDataModule):
@@ -87,7 +91,7 @@ def train(compose_config, tmp_path):
             f"paths.run_dir={directory}", "callbacks.pictures=null", "optimized_metric=val/distance"
         )
         torch.manual_seed(0)
-        net = nn.Sequential(nn.Flatten(), nn.Linear(NUM_KEYPOINTS * SIZE_PX**2, NUM_KEYPOINTS * 2))
+        net = KeypointNet(nn.Flatten(), nn.Linear(NUM_KEYPOINTS * SIZE_PX**2, NUM_KEYPOINTS * 2))
         module = KeypointStage(net, lambda parameters: torch.optim.Adam(parameters, learning_rate))
         trainer = lightning.Trainer(
             max_epochs=20,

@@ -23,7 +23,7 @@ class FakeSweep:
         (folder / "metrics.json").write_text(json.dumps(content))
         stage = MESH if "apve" in metrics else {}
         (folder / "record.json").write_text(json.dumps(RECORD | stage | changes))
-        (folder / "config.yaml").write_text("data:\n  num_points: 512\n")
+        (folder / "config.yaml").write_text("data: {observation: {num_points: 512}}\n")
         main = "apve" if "apve" in metrics else "mpjpe_eq38"
         lines = [f"epoch,step,train/loss,val/{main},val/mpjpe"]
         for epoch in range(3):

@@ -178,9 +178,9 @@ class Seen(Callback):
 
 
 def test_every_epoch_shows_its_own_samples_in_its_own_order(smoke_config, tmp_path, monkeypatch):
-    seen, original = Seen(), train_task.build_each
+    seen, original = Seen(), running.build_each
     monkeypatch.setattr(
-        train_task, "build_each", lambda node: [*original(node), *([seen] if "best" in node else [])]
+        running, "build_each", lambda node: [*original(node), *([seen] if "best" in node else [])]
     )
     train(smoke_config(tmp_path, "experiment=detector/basic", *RESUMED, "data.num_workers=2"))
     expected = []
