@@ -2,13 +2,15 @@
 
 from abc import abstractmethod
 from collections.abc import Sequence
-from typing import Any, TypedDict
+from typing import TYPE_CHECKING, Any, TypedDict
 
 from lightning.pytorch import LightningDataModule
 from torch import Tensor
 
 from ljn.body import BodyModel
-from ljn.cloud.observation import ObservationRecipe
+
+if TYPE_CHECKING:
+    from ljn.cloud.observation import ObservationRecipe
 
 SPLITS = ("train", "val", "test")
 
@@ -60,7 +62,7 @@ class DataModule(LightningDataModule):
         return ()
 
     @property
-    def recipe(self) -> ObservationRecipe | None:
+    def recipe(self) -> "ObservationRecipe | None":
         """How its observations are made, and what was trained with them: goes into checkpoints."""
         return None
 

@@ -46,12 +46,17 @@ def test_a_row_is_configured_as_the_experiment_that_it_trains(run_py, tmp_path):
 def test_the_detector_of_a_chain_has_the_calls_sizes_and_machine_and_nothing_of_the_other_stage(monkeypatch):
     typed = (
         *("experiment=mesh/chain", "name=x", "seed=3", "debug=overfit", "body.genders=[male]", "tags=[a]"),
-        *("data.num_points=64", "data.num_workers=0", "trainer.precision=64", "paths.output_dir='a=b'"),
+        *(
+            "data.observation.num_points=64",
+            "data.num_workers=0",
+            "trainer.precision=64",
+            "paths.output_dir='a=b'",
+        ),
         *(
             "model.num_iterations=1",
             "task.overrides=[]",
-            "data.initial_joints=noised",
-            "data.joint_noise_m=0.5",
+            "data.synthesis.initial_joints=noised",
+            "data.synthesis.joint_noise_m=0.5",
         ),
         *("optimized_metric=val/apve", "callbacks.best.mode=max", "callbacks.pictures=null", "num_threads=1"),
     )
@@ -59,9 +64,9 @@ def test_the_detector_of_a_chain_has_the_calls_sizes_and_machine_and_nothing_of_
     with initialize_config_dir(str(CONF), version_base="1.3"):
         cfg = _composed("detector/proposed")
     assert (cfg.seed, cfg.data.num_train, cfg.body.genders, cfg.tags) == (3, 8, ["male"], ["a"])
-    assert (cfg.data.num_points, cfg.data.num_workers, cfg.trainer.precision) == (64, 0, 64)
+    assert (cfg.data.observation.num_points, cfg.data.num_workers, cfg.trainer.precision) == (64, 0, 64)
     assert (cfg.paths.output_dir, cfg.callbacks.pictures, cfg.num_threads) == ("a=b", None, 1)
-    assert (cfg.data.initial_joints, cfg.data.joint_noise_m) == ("lifted", 0.02)
+    assert (cfg.data.synthesis.initial_joints, cfg.data.synthesis.joint_noise_m) == ("lifted", 0.02)
     assert (cfg.optimized_metric, cfg.callbacks.best.mode) == ("val/mpjpe", "min")
     assert cfg.task._target_ == "ljn.tasks.train.train"
 
