@@ -58,12 +58,12 @@ def shown(value: Any) -> str:
         return f"a value of type {type(value).__name__}"
 
 
-def reason(error: BaseException) -> str:
+def reason(error: BaseException, limit: int = 200) -> str:
     """Why something could not be read: the first words of an error, without advice to run what a file holds."""
     text = str(error)
     if any(word in text for word in _UNSAFE_ADVICE):
         return "it holds Python objects, which are never loaded, or is damaged"
-    return brief(text) or type(error).__name__
+    return brief(text, limit) or type(error).__name__
 
 
 _REPR = reprlib.Repr()
@@ -173,7 +173,7 @@ def check_pickle(content: bytes) -> None:
     A tuple that serves as a key is hashed through all its levels: thirty pairs of the pair before take an hour.
     """
     stack: list[int | None] = []  # the number of values that each stands for; None is a mark
-    memo: dict[int, int] = {}
+    memo: dict[Any, int] = {}
     for opcode, argument, _ in pickletools.genops(content):
         name, before = opcode.name, opcode.stack_before
         taken: list[int] = []

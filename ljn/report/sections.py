@@ -122,7 +122,7 @@ def pictures(results: Results) -> str:
 def embed(path: Path) -> str | None:
     """A picture as a data URI, at most 1,600 pixels wide; None, with a warning, for a damaged one."""
     try:
-        with Image.open(path) as opened:
+        with Image.open(path, formats=("PNG",)) as opened:
             image = opened.convert("RGB")
     except (OSError, ValueError, SyntaxError) as error:  # Pillow's PNG reader raises SyntaxError
         warnings.warn(f"'{path}' is left out of the report: {error}", stacklevel=2)

@@ -422,7 +422,7 @@ def test_a_flipped_byte_in_an_archive_is_called_damaged(tmp_path):
 
 def test_python_objects_in_an_archive_are_refused(tmp_path):
     path = write_npz(tmp_path / "body.npz", {**smpl_fields(), "weights": np.array([{}], object)})
-    with pytest.raises(ValueError, match="allow_pickle=False"):
+    with pytest.raises(ValueError, match=r"holds object of shape .*expected numbers or text"):
         load_body_model(path)
 
 
