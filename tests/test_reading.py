@@ -1,7 +1,6 @@
 """Files from outside that are damaged, forged or made to exhaust their reader."""
 
 import contextlib
-import copyreg
 import functools
 import json
 import pickle
@@ -23,7 +22,7 @@ from ljn.building import build
 from ljn.modules.joint_detector import JointDetector
 from ljn.pipeline.inputs import read_camera, read_depth, read_keypoints, read_mask
 from ljn.pipeline.keypoints import smpl_keypoints
-from ljn.runs.checkpoints import CHECKPOINT_VERSION, load_module
+from ljn.runs.checkpoints import CHECKPOINT_VERSION, load_module, read_checkpoint
 
 CAMERA = {"fx": 366.458, "fy": 366.736, "cx": 11.5, "cy": 9.25, "width": 24, "height": 20}
 ADVICE = ("weights_only", "allow_pickle", "pickle.load")
@@ -44,7 +43,12 @@ def body_fields(num_vertices=12):
 
 def checkpoint_content():
     """What a run keeps of a tiny detector."""
-    net = {"_target_": "ljn.nets.simple_baseline.SimpleBaseline", "channels": 8, "num_blocks": 1, "dropout": 0.5}
+    net = {
+        "_target_": "ljn.nets.simple_baseline.SimpleBaseline",
+        "channels": 8,
+        "num_blocks": 1,
+        "dropout": 0.5,
+    }
     config = {
         **dict.fromkeys(("preset", "body", "trainer"), {}),
         "model": net,
@@ -72,18 +76,18 @@ def write_clips(path):
     np.savez_compressed(path, poses=poses, clip=np.array(["walk", "run"] * 3))
 
 
-def read_checkpoint(path):
-    return load_module(path, JointDetector)[0].state_dict()
+def load_weights(path):
+    return as_arrays(load_module(path, JointDetector)[0].state_dict())
 
 
 def read_set(path):
     """A set of samples, one of whose files is at `path`; it may be remade, but never read wrong."""
     samples = {"points": torch.arange(60.0).view(5, 4, 3), "sample_id": torch.arange(5)}
-    return cached_samples(path.parents[1], path.parent.name, lambda: samples)
+    return as_arrays(cached_samples(path.parents[1], path.parent.name, lambda: samples))
 
 
-def write_set(path):
-    read_set(path)
+def as_arrays(tensors):
+    return {name: value.numpy().copy() for name, value in tensors.items()}
 
 
 KINDS = {
@@ -111,9 +115,9 @@ KINDS = {
         False,
     ),
     "clips.npz": (write_clips, read_clips, True),
-    "tiny.ckpt": (lambda path: torch.save(checkpoint_content(), path), read_checkpoint, True),
-    "set/points.npy": (write_set, read_set, True),
-    "set/index.json": (write_set, read_set, True),
+    "tiny.ckpt": (lambda path: torch.save(checkpoint_content(), path), load_weights, True),
+    "set/points.npy": (read_set, read_set, True),
+    "set/index.json": (read_set, read_set, True),
 }
 
 
@@ -175,35 +179,37 @@ def nested(pair, levels=40):
     return value
 
 
-def forged(module, name):
-    """A class whose instances are pickled as those of another module's class, and the state they get."""
-
-    def reduce(self):
-        return copyreg._reconstructor, (type(self), object, None), vars(self)
-
-    return type(name, (), {"__module__": module, "__reduce__": reduce})
-
-
 def png_of_size(width, height):
-    chunks = [(b"IHDR", struct.pack(">IIBBBBB", width, height, 16, 0, 0, 0, 0)), (b"IDAT", zlib.compress(b"")), (b"IEND", b"")]
+    header = struct.pack(">IIBBBBB", width, height, 16, 0, 0, 0, 0)
+    chunks = [(b"IHDR", header), (b"IDAT", zlib.compress(b"")), (b"IEND", b"")]
     return b"\x89PNG\r\n\x1a\n" + b"".join(
-        struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data)) for name, data in chunks
+        struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
+        for name, data in chunks
     )
 
 
 def write_zeros(path, name, shape, num_bytes):
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive, archive.open(name, "w") as file:
+    with (
+        zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive,
+        archive.open(name, "w") as file,
+    ):
         np.lib.format.write_array_header_1_0(file, {"descr": "<f4", "fortran_order": False, "shape": shape})
         for _ in range(num_bytes >> 20):
             file.write(bytes(1 << 20))
 
 
-def write_selections(path):
-    select = forged("chumpy.reordering", "Select")()
-    for _ in range(60):
-        inner, select = select, forged("chumpy.reordering", "Select")()
-        vars(select).update(a=inner, idxs=inner, preferred_shape=(1,))
-    path.write_bytes(pickle.dumps({**body_fields(), "weights": select}, protocol=2))
+def pickle_of_a_nested_key():
+    """Of a dict whose key is `nested` tuples: Python itself would never be done with making it."""
+    return b"\x80\x02}" + pickle.dumps(nested(lambda a, b: (a, b)), 2)[2:-1] + b"K\x01s."
+
+
+def write_nested_key(path):
+    torch.save({}, path)
+    with zipfile.ZipFile(path) as archive:
+        entries = {entry: archive.read(entry) for entry in archive.infolist()}
+    with zipfile.ZipFile(path, "w") as archive:
+        for entry, data in entries.items():
+            archive.writestr(entry, pickle_of_a_nested_key() if entry.filename.endswith("data.pkl") else data)
 
 
 def write_state(path, **state):
@@ -213,7 +219,9 @@ def write_state(path, **state):
 
 
 YAML_LISTS = "a0: &a0 [x, x]\n" + "".join(f"a{n}: &a{n} [*a{n - 1}, *a{n - 1}]\n" for n in range(1, 40))
-YAML_MERGES = "a0: &a0 {x: 1}\n" + "".join(f"a{n}: &a{n}\n  <<: [*a{n - 1}, *a{n - 1}]\n" for n in range(1, 40))
+YAML_MERGES = "a0: &a0 {x: 1}\n" + "".join(
+    f"a{n}: &a{n}\n  <<: [*a{n - 1}, *a{n - 1}]\n" for n in range(1, 40)
+)
 
 
 @pytest.mark.parametrize(
@@ -238,9 +246,8 @@ YAML_MERGES = "a0: &a0 {x: 1}\n" + "".join(f"a{n}: &a{n}\n  <<: [*a{n - 1}, *a{n
         ("stored.npz", lambda path: write_zeros(path, "depth.npy", (10**12,), 1 << 20)),
         ("clips.npz", lambda path: write_zeros(path, "poses.npy", (300 << 18,), 300 << 20)),
         ("body.npz", lambda path: write_zeros(path, "weights.npy", (10**6, 10**6), 1 << 20)),
-        ("body.pkl", lambda path: path.write_bytes(pickle.dumps({nested(lambda a, b: (a, b)): 1}, 4))),
-        ("body.pkl", write_selections),
-        ("tiny.ckpt", lambda path: torch.save({nested(lambda a, b: (a, b)): 1}, path)),
+        ("body.pkl", lambda path: path.write_bytes(pickle_of_a_nested_key())),
+        ("tiny.ckpt", write_nested_key),
         ("tiny.ckpt", lambda path: write_state(path, wide=torch.zeros(1).expand(10**9, 10**9))),
     ],
 )  # fmt: skip
@@ -279,8 +286,6 @@ def test_a_table_of_a_million_unknown_clips_is_refused_in_brief(tmp_path):
 
 # Checkpoints of odd content
 
-WEIGHT = "net.input.weight"
-
 
 def edit_state(**values):
     return lambda content, config: content["state_dict"].update(values)
@@ -311,13 +316,18 @@ def weight_name():
         (lambda content, config: content["state_dict"].update({3: torch.ones(1)}), "expected names, got 3"),
         (edit_state(extra=torch.ones(2)), "weights of another model"),
         (edit_state(extra=torch.eye(2).to_sparse()), "expected a tensor of plain numbers, got torch.sparse_coo"),
-        (edit_state(extra=torch.quantize_per_tensor(torch.ones(2), 0.1, 0, torch.qint8)), "got .* of torch.qint8"),
+        (
+            lambda content, config: content["state_dict"].update(
+                extra=torch.quantize_per_tensor(torch.ones(2), 0.1, 0, torch.qint8)
+            ),
+            "got .* of torch.qint8",
+        ),
         (edit_state(extra=torch.ones(2, dtype=torch.complex64)), "got .* of torch.complex64"),
         (edit_state(extra=torch.ones(2, device="meta")), "expected numbers that are in the file"),
         (edit_state(extra=torch.tensor([1.0, np.nan])), "extra: expected finite numbers"),
         (edit_state(extra=torch.tensor([1e300], dtype=torch.float64)), "extra: expected finite numbers"),
         (lambda content, config: content["state_dict"].clear(), "weights of another model"),
-        (lambda content, config: content.update(epoch=10**5000), "no whole configuration"),
+        (lambda content, config: content.update(epoch=2**40), "no whole configuration"),
         (lambda content, config: content["ljn"].update(run="x" * 5000), "no whole configuration"),
         (edit_config(name="???"), "no whole configuration"),
         (edit_config(data=[]), "no whole configuration"),
@@ -330,22 +340,22 @@ def weight_name():
         (edit_camera(fx="wide"), "expected six numbers"),
         (edit_camera(width=10**9), "in all at the most"),
         (edit_net(channels=10**9), "weights of another model"),
-        (edit_net(channels=10**30), "tiny.ckpt"),
-        (edit_net(channels="x" * 100_000), "tiny.ckpt"),
+        (edit_net(channels=10**30), ""),
+        (edit_net(channels="x" * 100_000), ""),
         (edit_net(num_blocks=10**9), "a smaller one than its configuration says"),
-        (edit_net(dropout=5), "tiny.ckpt"),
+        (edit_net(dropout=5), ""),
         (edit_net(_target_="x" * 100_000), "is outside the modules"),
         (edit_net(_target_="ljn.nets..x"), "cannot be found"),
-        (edit_net(_target_="ljn.geometry.camera.Camera"), "tiny.ckpt"),
+        (edit_net(_target_="ljn.geometry.camera.Camera"), ""),
         (lambda content, config: config["module"].pop("net"), "expected a network"),
-        (lambda content, config: config["module"].update(optimizer=3, surprise=1), "tiny.ckpt"),
+        (lambda content, config: config["module"].update(optimizer=3, surprise=1), ""),
     ],
 )  # fmt: skip
 def test_a_checkpoint_of_odd_content_is_refused(edit, message, tmp_path):
     content = checkpoint_content()
     edit(content, content["ljn"]["config"])
     torch.save(content, tmp_path / "tiny.ckpt")
-    with pytest.raises(ValueError, match=rf"ckpt_path: .*tiny\.ckpt.*{message}" if message != "tiny.ckpt" else message) as refusal:
+    with pytest.raises(ValueError, match=rf"ckpt_path: '.*tiny\.ckpt'.*{message}") as refusal:
         load_module(tmp_path / "tiny.ckpt", JointDetector)
     check_message(refusal.value)
 
@@ -357,14 +367,8 @@ def test_objects_in_a_checkpoint_are_refused_without_advice_to_load_them(tmp_pat
     check_message(refusal.value)
 
 
-def test_reading_a_checkpoint_draws_no_random_number(tmp_path):
+def test_checking_a_checkpoint_draws_no_random_number(tmp_path):
     torch.save(checkpoint_content(), tmp_path / "tiny.ckpt")
-    torch.manual_seed(3)
-    module = build(checkpoint_content()["ljn"]["config"]["module"])
-    torch.manual_seed(3)
-    load_module(tmp_path / "tiny.ckpt", JointDetector)
-    after = torch.get_rng_state()
-    torch.manual_seed(3)
-    build(checkpoint_content()["ljn"]["config"]["module"])
-    assert module is not None
-    assert torch.equal(after, torch.get_rng_state())
+    before = torch.get_rng_state()
+    read_checkpoint(tmp_path / "tiny.ckpt")
+    assert torch.equal(torch.get_rng_state(), before)
