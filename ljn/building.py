@@ -10,6 +10,8 @@ from typing import Any
 import hydra
 from omegaconf import DictConfig, OmegaConf
 
+from ljn.reading import brief, reason
+
 OWN_MODULES = (
     "ljn.nets.", "ljn.modules.", "ljn.geometry.camera.", "ljn.cloud.observation.", "datamodules.", "callbacks.",
 )  # fmt: skip
@@ -40,24 +42,23 @@ def check_targets(config: Any, where: str = "") -> None:
 
 def _check_target(target: str, where: str) -> None:
     allowed = ", ".join(_ALLOWED)
+    where, named = brief(where), f"`_target_: {brief(target)}`"
     if not target.startswith(_ALLOWED):
-        raise ValueError(
-            f"{where}: `_target_: {target}` is outside the modules that a config may name: {allowed}"
-        )
+        raise ValueError(f"{where}: {named} is outside the modules that a config may name: {allowed}")
     try:
         found = _find(target)
-    except (ImportError, AttributeError) as error:
-        raise ValueError(f"{where}: `_target_: {target}` cannot be found ({error})") from error
+    except (ImportError, AttributeError, ValueError) as error:  # a name with an empty part
+        raise ValueError(f"{where}: {named} cannot be found ({reason(error)})") from error
     home = f"{getattr(found, '__module__', None)}."
     if not isinstance(found, type) or not home.startswith(_ALLOWED):
         raise ValueError(
-            f"{where}: `_target_: {target}` leads to {type(found).__name__} of {home.rstrip('.')}; a config may name "
+            f"{where}: {named} leads to {type(found).__name__} of {home.rstrip('.')}; a config may name "
             f"classes of {allowed}"
         )
     for prefix, bases in _FOREIGN_BASES.items():
         if home.startswith(prefix) and not issubclass(found, tuple(_find(prefix + base) for base in bases)):
             raise ValueError(
-                f"{where}: `_target_: {target}` is none of the classes that a config may name of "
+                f"{where}: {named} is none of the classes that a config may name of "
                 f"{prefix.rstrip('.')}: those that inherit {' or '.join(bases)}"
             )
 
@@ -80,7 +81,7 @@ def build(config: DictConfig | Mapping[str, Any], **arguments: Any) -> Any:
         # The cause says what is wrong; Hydra's wrapper would hide its type from callers and users.
         if isinstance(error.__cause__, ValueError | FileNotFoundError | ImportError):
             raise error.__cause__ from None
-        raise ValueError(str(error)) from error
+        raise ValueError(reason(error, 1000)) from error
 
 
 def build_each(configs: DictConfig | None) -> list[Any]:

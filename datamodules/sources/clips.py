@@ -1,7 +1,6 @@
 """Reading motion clips and which split each belongs to."""
 
-import json
-import zipfile
+from collections import Counter
 from pathlib import Path
 from typing import NamedTuple
 
@@ -9,7 +8,7 @@ import numpy as np
 
 from datamodules.sources import SPLITS
 from ljn.body.skeleton import NUM_JOINTS
-from ljn.reading import READ_ERRORS
+from ljn.reading import READ_ERRORS, read_arrays, read_json, reason, shown
 
 
 class Clips(NamedTuple):
@@ -34,14 +33,12 @@ def read_clips(path: Path) -> Clips:
     if not path.is_file():
         raise FileNotFoundError(f"poses: no file {path}; leave `path` out to use the embedded clips")
     try:
-        if not zipfile.is_zipfile(path):
-            raise ValueError("not a .npz archive")
-        with np.load(path, allow_pickle=False) as file:
-            poses, clip = file["poses"].astype(np.float32), file["clip"].astype(str)
+        arrays = read_arrays(path, ("poses", "clip"))
+        poses, clip = arrays["poses"].astype(np.float32), arrays["clip"].astype(str)
     except READ_ERRORS as error:
         raise ValueError(
-            f"poses: {path} cannot be read ({error}); expected an .npz file with `poses` (N, 72) and `clip` (N,) "
-            "names"
+            f"poses: {path} cannot be read ({reason(error)}); expected an .npz file with `poses` (N, 72) and `clip` "
+            "(N,) names"
         ) from error
     if poses.ndim != 2 or poses.shape[1] != 3 * NUM_JOINTS or clip.shape != poses.shape[:1]:
         raise ValueError(
@@ -67,9 +64,9 @@ def read_split(path: Path, clips: Clips) -> dict[str, list[str]]:
     if not path.is_file():
         raise FileNotFoundError(f"poses: no split file {path}")
     try:
-        table = json.loads(path.read_text())
-    except ValueError as error:
-        raise ValueError(f"poses: {path} is no JSON file ({error})") from error
+        table = read_json(path)
+    except READ_ERRORS as error:
+        raise ValueError(f"poses: {path} is no JSON file ({reason(error)})") from error
     lists = (
         {name: _joined(table[name]) for name in SPLITS if name in table} if isinstance(table, dict) else {}
     )
@@ -78,13 +75,13 @@ def read_split(path: Path, clips: Clips) -> dict[str, list[str]]:
         raise ValueError(
             f"poses: {path} must hold a list of clips, or strata with such lists, for each of {', '.join(SPLITS)}"
         )
-    named = [clip for name in SPLITS for clip in split[name]]
-    unknown = sorted(set(named) - set(clips.clip.tolist()))
-    twice = sorted({clip for clip in named if named.count(clip) > 1})
+    named = Counter(clip for name in SPLITS for clip in split[name])
+    unknown = sorted(named.keys() - set(clips.clip.tolist()))
+    twice = sorted(clip for clip, count in named.items() if count > 1)
     if unknown or twice:
         raise ValueError(
             f"poses: {path} must list each clip under one of {', '.join(SPLITS)}; unknown clips: "
-            f"{unknown or 'none'}, clips named twice: {twice or 'none'}"
+            f"{shown(unknown) if unknown else 'none'}, clips named twice: {shown(twice) if twice else 'none'}"
         )
     return split
 

@@ -5,9 +5,7 @@ either package and without running anything.
 """
 
 import hashlib
-import io
 import re
-import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -18,7 +16,7 @@ from numpy.typing import NDArray
 
 from ljn.body.skeleton import NUM_JOINTS, PARENTS
 from ljn.body.unpickling import ForbiddenContentError, read_pickled_arrays
-from ljn.reading import READ_ERRORS
+from ljn.reading import READ_ERRORS, read_arrays, reason, shown
 
 GENDERS: dict[str, int] = {"female": 0, "male": 1, "neutral": 2}
 """Gender codes: SURREAL's 0 and 1, and neutral."""
@@ -145,12 +143,12 @@ def load_body_model(path: str | Path | None = None, gender: str = "neutral") -> 
         raise ValueError(f"path: a body model should be a .npz or .pkl file, got {path}")
 
     try:
-        arrays = _READERS[path.suffix.lower()](path.read_bytes())
+        arrays = _READERS[path.suffix.lower()](path)
     except ForbiddenContentError as error:
         raise ValueError(f"{path}: {error} {_NOT_SMPL}") from error
     except READ_ERRORS as error:
         raise ValueError(
-            f"{path}: cannot be read ({error}): damaged, or no SMPL model. Fetch it again."
+            f"{path}: cannot be read ({reason(error)}): damaged, or no SMPL model. Fetch it again."
         ) from error
     return _assemble(arrays, gender, path)
 
@@ -213,7 +211,7 @@ def _assemble(arrays: Mapping[str, Any], gender: str, path: Path) -> BodyModel:
     if root not in (-1, 2**32 - 1) or tuple(parents) != PARENTS[1:]:
         raise ValueError(
             f"{path}: kintree_table should have shape (2, {NUM_JOINTS}) and begin with {PARENTS}, "
-            f"got shape {table.shape} and {(root, *parents)}. {_NOT_SMPL}"
+            f"got shape {table.shape} and {shown((root, *parents))}. {_NOT_SMPL}"
         )
     shapedirs = arrays["shapedirs"]
     if shapedirs.ndim != 3 or shapedirs.shape[2] < NUM_BETAS:
@@ -238,19 +236,16 @@ def _check_gender(gender: str) -> None:
         raise ValueError(f"gender: expected one of {', '.join(GENDERS)}, got {gender!r}")
 
 
-def _read_npz(data: bytes) -> dict[str, NDArray[Any]]:
-    if not zipfile.is_zipfile(io.BytesIO(data)):
-        raise ValueError("not a .npz archive")
-    with np.load(io.BytesIO(data), allow_pickle=False) as archive:
-        return {key: archive[key] for key in _KEYS if key in archive.files}
+def _read_npz(path: Path) -> dict[str, NDArray[Any]]:
+    return read_arrays(path, _KEYS)
 
 
-def _read_pkl(data: bytes) -> dict[str, NDArray[Any]]:
-    return read_pickled_arrays(data, _KEYS)
+def _read_pkl(path: Path) -> dict[str, NDArray[Any]]:
+    return read_pickled_arrays(path.read_bytes(), _KEYS)
 
 
 _FILE_NAMES = {
     gender: re.compile(rf"(smpl_)?{gender}|basicmodel_{official}_.*")
     for gender, official in (("female", "f"), ("male", "m"), ("neutral", "neutral"))
 }
-_READERS: dict[str, Callable[[bytes], Mapping[str, Any]]] = {".npz": _read_npz, ".pkl": _read_pkl}
+_READERS: dict[str, Callable[[Path], Mapping[str, Any]]] = {".npz": _read_npz, ".pkl": _read_pkl}

@@ -16,6 +16,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ljn.reading import check_pickle
+
+_MAX_LEVELS = 5
+"""Of arrays made from arrays; official files have three."""
+
 
 class ForbiddenContentError(Exception):
     """The file is well formed, but holds or names what it should not."""
@@ -36,6 +41,7 @@ def read_pickled_arrays(data: bytes, keys: Sequence[str]) -> dict[str, NDArray[A
         # The C unpickler of Python up to 3.13 allocates as many slots as the largest number says.
         if opcode.name in ("PUT", "BINPUT", "LONG_BINPUT") and (argument or 0) > len(data):
             raise ValueError("a memo number beyond the file's size")
+    check_pickle(data)
     content = _DataUnpickler(io.BytesIO(data), encoding="latin1").load()
     if not isinstance(content, dict):
         raise ForbiddenContentError(f"should hold a dict, got {type(content).__name__}.")
@@ -102,6 +108,13 @@ class _Coordinates(_Record):
     """`scipy.sparse`'s coo form."""
 
 
+class _OrderedDict(dict):
+    """`collections.OrderedDict`; entries that come as arguments, as Python 2 wrote them, are left out."""
+
+    def __init__(self, *_: Any) -> None:
+        super().__init__()
+
+
 class _Reconstructor(_Record):
     """`copyreg._reconstructor`: Python 2's way to make an instance of a class without calling it."""
 
@@ -113,10 +126,11 @@ class _Reconstructor(_Record):
 
 _NAMES: dict[str, dict[str, type]] = {
     "builtins": {
-        "object": _Record, "list": list, "dict": dict, "tuple": tuple, "set": set, "frozenset": frozenset,
+        # Not the containers themselves: a call for each few bytes of the file could copy a large one.
+        "object": _Record, "list": _Record, "dict": _Record, "tuple": _Record, "set": _Record, "frozenset": _Record,
         "bytes": _Bytes, "bytearray": _Bytes,
     },
-    "collections": {"OrderedDict": dict},
+    "collections": {"OrderedDict": _OrderedDict},
     "copyreg": {"_reconstructor": _Reconstructor},
     "_codecs": {"encode": _Bytes},
     "numpy": {"ndarray": _Array, "dtype": _Dtype},
@@ -155,8 +169,10 @@ class _DataUnpickler(pickle.Unpickler):
         )
 
 
-def _decode(value: Any, key: str, limit: int) -> NDArray[Any]:
+def _decode(value: Any, key: str, limit: int, level: int = 0) -> NDArray[Any]:
     """The array that a record describes; no larger than the file, which has `limit` bytes."""
+    if level == _MAX_LEVELS:  # a selection from itself by itself, and so on, takes 2^levels steps
+        raise ValueError(f"{key} made from arrays in more than {_MAX_LEVELS} levels")
     if isinstance(value, _Array) and isinstance(value.state, tuple) and len(value.state) == 5:
         _, shape, dtype, is_fortran, content = value.state
         return _decode_buffer(content, dtype, shape, "F" if is_fortran else "C")
@@ -164,12 +180,12 @@ def _decode(value: Any, key: str, limit: int) -> NDArray[Any]:
         content, dtype, shape, order = value.args[:4]
         return _decode_buffer(content, dtype, shape, order)
     if isinstance(value, _Ch):
-        return _decode(value["x"], key, limit)
+        return _decode(value["x"], key, limit, level + 1)
     if isinstance(value, _Select):
-        selected = _decode(value["a"], key, limit).ravel()[_decode(value["idxs"], key, limit).ravel()]
-        return selected.reshape(value["preferred_shape"])
+        array, indices = (_decode(value[name], key, limit, level + 1).ravel() for name in ("a", "idxs"))
+        return array[indices].reshape(value["preferred_shape"])
     if isinstance(value, _Compressed | _Coordinates):
-        return _decode_sparse(value, key, limit)
+        return _decode_sparse(value, key, limit, level + 1)
     raise ForbiddenContentError(f"{key} should be an array, a chumpy array or a sparse matrix.")
 
 
@@ -192,18 +208,18 @@ def _decode_buffer(content: Any, dtype: Any, shape: Any, order: Any) -> NDArray[
     return array.reshape(shape, order=order)
 
 
-def _decode_sparse(matrix: _Record, key: str, limit: int) -> NDArray[Any]:
+def _decode_sparse(matrix: _Record, key: str, limit: int, level: int) -> NDArray[Any]:
     num_rows, num_columns = matrix["_shape"]
     # Checked before anything is allocated: a few bytes can claim any shape.
     if min(num_rows, num_columns) < 0 or num_rows * num_columns > limit:
         raise ValueError(f"{key} as a sparse matrix of shape {(num_rows, num_columns)}")
-    values = _decode(matrix["data"], key, limit)
+    values = _decode(matrix["data"], key, limit, level)
     if isinstance(matrix, _Coordinates):
         coordinates = matrix.state.get("coords") or (matrix["row"], matrix["col"])
-        rows, columns = (_decode(indices, key, limit) for indices in coordinates)
+        rows, columns = (_decode(indices, key, limit, level) for indices in coordinates)
     else:
-        columns = _decode(matrix["indices"], key, limit)
-        ends = _decode(matrix["indptr"], key, limit)
+        columns = _decode(matrix["indices"], key, limit, level)
+        ends = _decode(matrix["indptr"], key, limit, level)
         if ends[-1] != len(values):
             raise ValueError(f"{key} as a sparse matrix that ends elsewhere than its values")
         rows = np.searchsorted(ends[1:], np.arange(len(values)), side="right")

@@ -2,11 +2,16 @@
 
 import math
 from dataclasses import dataclass
+from numbers import Real
 
 import torch
 from torch import Tensor
 
 from ljn.geometry.rotations import CAMERA_FROM_BODY
+from ljn.reading import brief
+
+MAX_PIXELS = 4096 * 4096
+"""Of an image."""
 
 
 @dataclass(frozen=True)
@@ -30,8 +35,18 @@ class Camera:
     height: int
 
     def __post_init__(self) -> None:
+        values = vars(self).values()
+        if not all(isinstance(value, Real) and not isinstance(value, bool) for value in values):
+            raise ValueError(f"camera: expected six numbers, pixels, got {brief(str(self))}")
         if not all(0 < value < math.inf for value in (self.fx, self.fy, self.width, self.height)):
-            raise ValueError(f"camera: focal lengths and image size must be positive and finite, got {self}")
+            raise ValueError(
+                f"camera: focal lengths and image size must be positive and finite, got {brief(str(self))}"
+            )
+        if self.width % 1 or self.height % 1 or self.width * self.height > MAX_PIXELS:
+            raise ValueError(
+                f"camera: expected whole numbers of pixels, {MAX_PIXELS} in all at the most, got an image of "
+                f"{self.width} x {self.height} (width x height); give the image's own size"
+            )
         if not (0 <= self.cx < self.width and 0 <= self.cy < self.height):
             raise ValueError(
                 f"camera: the principal point ({self.cx}, {self.cy}) lies outside the image of "

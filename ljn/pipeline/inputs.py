@@ -1,15 +1,13 @@
 """Reading what a user has: depth images, masks, cameras and keypoints."""
 
-import json
 import math
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 
-from ljn.geometry.camera import Camera
-from ljn.reading import READ_ERRORS
+from ljn.geometry.camera import MAX_PIXELS, Camera
+from ljn.reading import READ_ERRORS, brief, read_arrays, read_json, read_yaml, reason, shown
 
 DEPTH_SUFFIXES = (".png", ".npy", ".npz")
 _GREY = ("1", "L", "I", "I;16", "I;16B", "F")  # Pillow's modes of one channel
@@ -41,19 +39,14 @@ def read_depth(path: str | Path) -> np.ndarray:
             )
         return image
     try:
-        with path.open("rb") as file:
-            content = np.load(file, allow_pickle=False)
-            if isinstance(content, np.ndarray):
-                return content
-            names = content.files
-            if len(names) == 1 or "depth" in names:
-                array = content["depth" if "depth" in names else names[0]]
-                if not isinstance(array, np.ndarray):
-                    raise TypeError("its entry is no array")
-                return array
+        arrays = read_arrays(path)
     except READ_ERRORS as error:
         raise _unreadable("depth", path, error) from error
-    raise ValueError(f"depth: expected one array or one with the key 'depth' in '{path}', got {names}")
+    if len(arrays) == 1 or "depth" in arrays:
+        return arrays["depth"] if "depth" in arrays else next(iter(arrays.values()))
+    raise ValueError(
+        f"depth: expected one array or one with the key 'depth' in '{path}', got {shown(list(arrays))}"
+    )
 
 
 def read_mask(path: str | Path) -> np.ndarray:
@@ -79,11 +72,13 @@ def read_camera(path: str | Path) -> Camera:
     """
     path = _existing(path, "camera")
     try:
-        content = yaml.safe_load(path.read_text())
-    except (yaml.YAMLError, *READ_ERRORS) as error:
+        content = read_yaml(path)
+    except READ_ERRORS as error:
         raise _unreadable("camera", path, error) from error
     if not isinstance(content, dict):
-        raise ValueError(f"camera: expected the keys {', '.join(_CAMERA_KEYS)} in '{path}', got {content!r}")
+        raise ValueError(
+            f"camera: expected the keys {', '.join(_CAMERA_KEYS)} in '{path}', got {shown(content)}"
+        )
     values = {str(key): value for key, value in content.items() if not str(key).startswith("_")}
     for problem, names in (
         ("are missing", [key for key in _CAMERA_KEYS if key not in values]),
@@ -94,7 +89,7 @@ def read_camera(path: str | Path) -> Camera:
     ):
         if names:
             raise ValueError(
-                f"camera: expected the keys {', '.join(_CAMERA_KEYS)} in '{path}': {', '.join(names)} {problem}"
+                f"camera: expected the keys {', '.join(_CAMERA_KEYS)} in '{path}': {brief(', '.join(names))} {problem}"
             )
     fx, fy, cx, cy, width, height = (_camera_number(values[key], key, path) for key in _CAMERA_KEYS)
     for key, size in (("width", width), ("height", height)):
@@ -114,7 +109,7 @@ def read_keypoints(path: str | Path) -> Any:
     """
     path = _existing(path, "keypoints")
     try:
-        return json.loads(path.read_text())
+        return read_json(path)
     except READ_ERRORS as error:
         raise _unreadable("keypoints", path, error) from error
 
@@ -127,7 +122,8 @@ def _camera_number(value: Any, key: str, path: Path) -> float:
         number = math.nan
     if not math.isfinite(number):
         raise ValueError(
-            f"camera: {key}: expected a finite number in '{path}', got {value!r}; give it in pixels, such as {key}: 366"
+            f"camera: {key}: expected a finite number in '{path}', got {shown(value)}; give it in pixels, such as "
+            f"{key}: 366"
         )
     return number
 
@@ -135,11 +131,16 @@ def _camera_number(value: Any, key: str, path: Path) -> float:
 def _read_png(path: Path, name: str) -> np.ndarray:
     from PIL import Image
 
-    unreadable: tuple[type[Exception], ...] = (Image.DecompressionBombError, *READ_ERRORS)
+    bombs: tuple[type[Exception], ...] = (Image.DecompressionBombError, Image.DecompressionBombWarning)
     try:
-        with Image.open(path) as image:
+        # Another format can start a program: PostScript, whatever the file's name, starts Ghostscript.
+        with Image.open(path, formats=("PNG",)) as image:
+            if image.width * image.height > MAX_PIXELS:
+                raise ValueError(f"{image.width} x {image.height} pixels, expected at most {MAX_PIXELS}")
+            image.verify()  # compares all checksums; then it has to be opened anew
+        with Image.open(path, formats=("PNG",)) as image:
             return np.asarray(image if image.mode in _GREY else image.convert("RGB"))
-    except unreadable as error:
+    except (*bombs, *READ_ERRORS) as error:
         raise _unreadable(name, path, error) from error
 
 
@@ -151,5 +152,6 @@ def _existing(path: str | Path, name: str) -> Path:
 
 
 def _unreadable(name: str, path: Path, error: Exception) -> ValueError:
-    reason = str(error).strip().split("\n")[0] or type(error).__name__
-    return ValueError(f"{name}: '{path}' is damaged, cut off or of another format ({reason}); write it again")
+    return ValueError(
+        f"{name}: '{path}' is damaged, cut off or of another format ({reason(error)}); write it again"
+    )

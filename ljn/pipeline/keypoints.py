@@ -14,6 +14,7 @@ import numpy as np
 
 from ljn.body.skeleton import JOINT_INDEX, JOINT_NAMES, NUM_JOINTS
 from ljn.geometry.camera import Camera
+from ljn.reading import brief, reason, shown
 
 MIN_CONFIDENCE = 0.2
 """Keypoints of a lower confidence count as missing."""
@@ -226,7 +227,7 @@ def _parse(keypoints: Any) -> tuple[str, np.ndarray]:
             return _parse_entries([keypoints.get(entry) for entry in order.names], name)
     given = set(map(str, keypoints))
     nearest = max(ORDERS, key=lambda name: len(given & set(ORDERS[name].names)))
-    unknown = ", ".join(sorted(given - set(ORDERS[nearest].names))) or "none at all"
+    unknown = brief(", ".join(sorted(given - set(ORDERS[nearest].names)))) or "none at all"
     raise ValueError(
         f"keypoints: the names belong to no one order of {', '.join(ORDERS)}; not in {nearest}: {unknown}. Its names: "
         f"{', '.join(ORDERS[nearest].names)}"
@@ -237,7 +238,7 @@ def _only_person(people: Any) -> np.ndarray:
     """`(K, 3)` of OpenPose's `people`."""
     is_list = isinstance(people, Sequence) and not isinstance(people, str)
     if not is_list or len(people) != 1:
-        got = len(people) if is_list else repr(people)
+        got = len(people) if is_list else shown(people)
         raise ValueError(
             f"keypoints: expected one person in OpenPose's file, got {got}; keep the one that the depth image shows"
         )
@@ -246,24 +247,24 @@ def _only_person(people: Any) -> np.ndarray:
     try:
         return np.asarray(flat, np.float64).reshape(-1, 3)
     except (TypeError, ValueError, OverflowError) as error:
-        shown = "none" if flat is None else f"others ({error})"
+        got = "none" if flat is None else f"others ({reason(error)})"
         raise ValueError(
             "keypoints: expected u, v and confidence of each keypoint, one after another, under 'pose_keypoints_2d' of "
-            f"OpenPose's person, got {shown}; have OpenPose write the file again, with its model BODY_25"
+            f"OpenPose's person, got {got}; have OpenPose write the file again, with its model BODY_25"
         ) from error
 
 
 def _parse_entries(entries: Any, name: Any) -> tuple[str, np.ndarray]:
     if name is not None and not (isinstance(name, str) and name in ORDERS):
         raise ValueError(
-            f"keypoints: expected an order of {', '.join(ORDERS)}, got {name!r}; give one of these names, or leave the "
-            "order out"
+            f"keypoints: expected an order of {', '.join(ORDERS)}, got {shown(name)}; give one of these names, or "
+            "leave the order out"
         )
     try:
         table = np.array([_entry(entry) for entry in entries], np.float64).reshape(-1, 3)
     except (TypeError, ValueError, OverflowError) as error:
         raise ValueError(
-            f"keypoints: expected [u, v] or [u, v, confidence] for each, in pixels, or null ({error})"
+            f"keypoints: expected [u, v] or [u, v, confidence] for each, in pixels, or null ({reason(error)})"
         ) from error
     by_size = {len(order.names): known for known, order in ORDERS.items()}
     name = name or by_size.get(len(table))
@@ -282,8 +283,8 @@ def _entry(entry: Any) -> list[float]:
     if entry is None:
         return [np.nan, np.nan, 0]
     if isinstance(entry, str):
-        raise TypeError(f"got the text {entry!r}")
+        raise TypeError(f"got the text {shown(entry)}")
     values = [np.nan if value is None else float(value) for value in entry]
     if len(values) not in (2, 3):
-        raise ValueError(f"got {len(values)} numbers: {values}")
+        raise ValueError(f"got {len(values)} numbers: {shown(values)}")
     return values if len(values) == 3 else [*values, 1]

@@ -1,6 +1,7 @@
 """Checkpoints: written whole or not at all, with where they came from; read as data, never as code."""
 
 import hashlib
+import io
 import os
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
@@ -11,15 +12,24 @@ import torch
 from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 from torch import Tensor
+from torch.nn.modules.module import register_module_parameter_registration_hook
 
-from ljn.building import build
+from ljn.building import build, check_targets
 from ljn.cloud.observation import ObservationRecipe
+from ljn.geometry.camera import Camera
 from ljn.modules.base import StageModule
-from ljn.reading import READ_ERRORS
+from ljn.reading import READ_ERRORS, brief, check_archive, plain_values, reason, shown
 from ljn.runs.keys import CONFIG_GROUPS
 
 CHECKPOINT_VERSION = 3
 _PROVENANCE_KEY = "ljn"
+_CONTENT_ERRORS: tuple[type[Exception], ...] = (ImportError, *READ_ERRORS)
+_MAX_TEXT = 1000
+_MAX_SHARING = 16
+_DTYPES = (
+    torch.float16, torch.bfloat16, torch.float32, torch.float64, torch.bool, torch.uint8, torch.int8, torch.int16,
+    torch.int32, torch.int64,
+)  # fmt: skip
 
 
 class Provenance(Callback):
@@ -125,11 +135,12 @@ def read_checkpoint(path: str | Path, name: str = "ckpt_path") -> Checkpoint:
             f"{name}: no file '{path}'; a run keeps its best checkpoint in RUN_DIRECTORY/checkpoints/best.ckpt"
         )
     try:
-        content = torch.load(path, map_location="cpu", weights_only=True)
+        data = path.read_bytes()
+        check_archive(data)
+        content = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
     except READ_ERRORS as error:
-        reason = str(error).strip().split("\n")[0]
         raise ValueError(
-            f"{name}: '{path}' is damaged, truncated or no checkpoint at all ({reason}); copy it again, or "
+            f"{name}: '{path}' is damaged, truncated or no checkpoint at all ({reason(error)}); copy it again, or "
             "use another one of the run"
         ) from error
     provenance: Any = content.get(_PROVENANCE_KEY) if isinstance(content, dict) else None
@@ -149,17 +160,25 @@ def read_checkpoint(path: str | Path, name: str = "ckpt_path") -> Checkpoint:
                 else "train it again, or evaluate it with the version it is from"
             )
         )
-    return Checkpoint(
+    checkpoint = Checkpoint(
         path=path,
         config=provenance["config"],
         body_hash=provenance["body_hash"],
         data_licence=provenance["data_licence"],
         run=provenance["run"],
-        epoch=int(content["epoch"]) + 1,
+        epoch=content["epoch"] + 1,
         recipe=_recipe(provenance.get("observation"), path, name),
-        state=content["state_dict"],
-        file_hash=hashlib.sha256(path.read_bytes()).hexdigest()[:16],
+        state=dict(content["state_dict"]),
+        file_hash=hashlib.sha256(data).hexdigest()[:16],
     )
+    try:
+        _check_state(checkpoint.state, len(data))
+        _check_content(checkpoint)
+    except _CONTENT_ERRORS as error:
+        raise ValueError(
+            f"{name}: '{path}': {reason(error, 1000)}; use another checkpoint of the run"
+        ) from error
+    return checkpoint
 
 
 def _recipe(content: Any, path: Path, name: str) -> ObservationRecipe | None:
@@ -167,31 +186,102 @@ def _recipe(content: Any, path: Path, name: str) -> ObservationRecipe | None:
         return None
     try:
         return ObservationRecipe(**content)
-    except (TypeError, ValueError) as error:
+    except _CONTENT_ERRORS as error:
         raise ValueError(
-            f"{name}: '{path}' holds no recipe of observations that is known here ({error})"
+            f"{name}: '{path}' holds no recipe of observations that is known here ({reason(error)})"
         ) from error
 
 
 def _is_ours(content: Any, provenance: Any) -> bool:
     types = {"version": int, "config": dict, "body_hash": str, "data_licence": str, "run": str}
+    config_types = dict.fromkeys(("preset", "model", "module", "data", "body", "trainer"), dict)
     return (
         isinstance(provenance, dict)
         and all(isinstance(provenance.get(name), kind) for name, kind in types.items())
+        and max(len(provenance[name]) for name in ("body_hash", "data_licence", "run")) <= _MAX_TEXT
+        and abs(provenance["version"]) < 2**31
         and all(group in provenance["config"] for group in CONFIG_GROUPS)
-        # A stored configuration is resolved. An interpolation would be resolved here, on this machine's values.
-        and not _has_interpolation(provenance["config"])
+        and all(isinstance(provenance["config"][name], kind) for name, kind in config_types.items())
+        and _is_resolved(provenance["config"])
         and isinstance(content.get("state_dict"), dict)
         and isinstance(content.get("epoch"), int)
+        and 0 <= content["epoch"] < 2**31
     )
 
 
-def _has_interpolation(value: Any) -> bool:
-    if isinstance(value, Mapping):
-        return any(_has_interpolation(entry) for entry in value.values())
-    if isinstance(value, list | tuple):
-        return any(_has_interpolation(entry) for entry in value)
-    return isinstance(value, str) and "${" in value
+def _is_resolved(config: Any) -> bool:
+    """Whether a configuration is plain values: an interpolation would be resolved here, on this machine's values."""
+    try:
+        return not any(
+            isinstance(value, str) and ("${" in value or value == "???") for value in plain_values(config)
+        )
+    except ValueError:
+        return False
+
+
+def _check_state(state: Mapping[Any, Any], file_size: int) -> None:
+    """Raise a `ValueError` unless a state dict is finite numbers under names, no larger than its file explains."""
+    size = 0
+    for name, value in state.items():
+        if not isinstance(name, str):
+            raise ValueError(f"state_dict: expected names, got {shown(name)}")
+        if not (isinstance(value, Tensor) and value.layout == torch.strided and value.dtype in _DTYPES):
+            what = f"{value.layout} of {value.dtype}" if isinstance(value, Tensor) else type(value).__name__
+            raise ValueError(f"state_dict: {brief(name)}: expected a tensor of plain numbers, got {what}")
+        # Tensors may share memory, and a few bytes can stand for any shape.
+        size += value.numel() * value.element_size()
+        if value.device.type != "cpu" or size > _MAX_SHARING * file_size:
+            raise ValueError(f"state_dict: {brief(name)}: expected numbers that are in the file")
+        if value.is_floating_point() and not value.float().isfinite().all():
+            raise ValueError(
+                f"state_dict: {brief(name)}: expected finite numbers; has the training diverged?"
+            )
+
+
+def _check_content(checkpoint: Checkpoint) -> None:
+    """Raise a `ValueError` unless the weights are those of the network, and the camera is one.
+
+    The network is built without memory for its weights: a configuration can ask for any width.
+    """
+    module, camera = checkpoint.config["module"], checkpoint.config["data"].get("camera")
+    check_targets({name: checkpoint.config[name] for name in CONFIG_GROUPS}, "the checkpoint's config")
+    if camera is not None and not isinstance(build(camera), Camera):
+        raise ValueError("the checkpoint's config.data.camera: expected a camera")
+    num_parameters = 0
+
+    def count(*_: Any) -> None:
+        nonlocal num_parameters
+        num_parameters += 1
+        if num_parameters > len(checkpoint.state):
+            raise ValueError("holds the weights of another model, a smaller one than its configuration says")
+
+    counting = register_module_parameter_registration_hook(count)
+    try:
+        with torch.device("meta"):
+            net = build(module.get("net"))
+    finally:
+        counting.remove()
+    if not isinstance(net, torch.nn.Module):
+        raise ValueError(
+            f"the checkpoint's config.module.net: expected a network, got a {type(net).__name__}"
+        )
+    expected = {f"net.{name}": value for name, value in net.state_dict().items()}
+    _check_shapes(expected, {name: checkpoint.state[name] for name in checkpoint.state if name in expected})
+
+
+def _check_shapes(expected: Mapping[str, Tensor], got: Mapping[str, Tensor]) -> None:
+    shapes, got_shapes = (
+        {name: tuple(value.shape) for name, value in state.items()} for state in (expected, got)
+    )
+    if shapes != got_shapes:
+        differing = sorted(
+            name for name in shapes.keys() | got_shapes.keys() if shapes.get(name) != got_shapes.get(name)
+        )
+        name = differing[0]
+        raise ValueError(
+            f"holds the weights of another model: {len(differing)} tensors differ, the first is '{brief(name)}', "
+            f"expected {shapes.get(name, 'none')}, got {shown(got_shapes.get(name, 'none'))}"
+        )
 
 
 def load_state(module: torch.nn.Module, checkpoint: Checkpoint, argument: str = "ckpt_path") -> None:
@@ -205,17 +295,10 @@ def load_state(module: torch.nn.Module, checkpoint: Checkpoint, argument: str = 
     Raises:
         ValueError: The weights belong to another model.
     """
-    expected = {name: tuple(value.shape) for name, value in module.state_dict().items()}
-    got = {name: tuple(value.shape) for name, value in checkpoint.state.items()}
-    if expected != got:
-        differing = sorted(
-            name for name in expected.keys() | got.keys() if expected.get(name) != got.get(name)
-        )
-        name = differing[0]
-        raise ValueError(
-            f"{argument}: '{checkpoint.path}' holds the weights of another model: {len(differing)} tensors differ, "
-            f"the first is '{name}', expected {expected.get(name, 'none')}, got {got.get(name, 'none')}"
-        )
+    try:
+        _check_shapes(module.state_dict(), checkpoint.state)
+    except ValueError as error:
+        raise ValueError(f"{argument}: '{checkpoint.path}' {error}") from None
     module.load_state_dict(checkpoint.state)
 
 
@@ -232,7 +315,10 @@ def load_module(path: str | Path, kind: type[StageModule], name: str = "ckpt_pat
         ValueError: See `read_checkpoint` and `load_state`; or the checkpoint is of another kind.
     """
     checkpoint = read_checkpoint(path, name)
-    module = build(checkpoint.config["module"])
+    try:
+        module = build(checkpoint.config["module"])
+    except ValueError as error:
+        raise ValueError(f"{name}: '{path}': {error}") from error
     if not isinstance(module, kind):
         raise ValueError(
             f"{name}: expected the checkpoint of a {kind.__name__}, but '{path}' is that of a "

@@ -56,10 +56,20 @@ def test_views_that_are_not_contiguous_are_kept_right(tmp_path):
         lambda place: (place / "points.npy").write_bytes((place / "points.npy").read_bytes()[:-8]),
         lambda place: (place / "points.npy").write_bytes(b"noise" * 40),
         lambda place: np.save(place / "points.npy", np.zeros((3, 3, 2), np.float32)),
+        lambda place: np.save(place / "points.npy", np.zeros((4, 3, 2), np.float32)),
         lambda place: (place / "index.json").unlink(),
         lambda place: (place / "index.json").write_text('{"points": [4'),
     ],
-    ids=["no array", "empty array", "cut array", "no array file", "another shape", "no index", "cut index"],
+    ids=[
+        "no array",
+        "empty array",
+        "cut array",
+        "no array file",
+        "another shape",
+        "other values",
+        "no index",
+        "cut index",
+    ],
 )
 def test_a_damaged_set_is_made_anew_with_a_warning(tmp_path, damage):
     cached_samples(tmp_path, "key", make_samples)

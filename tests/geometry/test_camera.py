@@ -94,6 +94,20 @@ def test_focal_lengths_and_sizes_must_be_positive_and_finite(kinect, name, value
         dataclasses.replace(kinect, **{name: value})
 
 
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"fx": "366"}, "expected six numbers"),
+        ({"cy": None}, "expected six numbers"),
+        ({"width": 423.5}, "expected whole numbers of pixels"),
+        ({"height": 10**9}, "16777216 in all at the most"),
+    ],
+)
+def test_what_is_no_camera_is_refused(kinect, change, message):
+    with pytest.raises(ValueError, match=f"camera: .*{message}"):
+        dataclasses.replace(kinect, **change)
+
+
 @pytest.mark.parametrize("change", [{"cx": -1.0}, {"cx": 424.0}, {"cy": 600.0}, {"cy": math.nan}])
 def test_the_principal_point_must_lie_inside_the_image(kinect, change):
     with pytest.raises(ValueError, match=r"principal point .* lies outside the image of 424 x 512"):
