@@ -160,6 +160,9 @@ def check_archive(content: bytes) -> None:
         entries = archive.infolist()
         if any(entry.compress_type != zipfile.ZIP_STORED for entry in entries):
             raise ValueError("a compressed archive, which PyTorch does not write")
+        # One bit of them calls an entry a folder: PyTorch then takes whatever stands in memory for its content.
+        if any(entry.external_attr for entry in entries):
+            raise ValueError("attributes of files, which PyTorch does not write")
         _check_entries(entries, len(content))
         for entry in entries:
             data = archive.read(entry)  # compares the checksum

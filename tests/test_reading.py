@@ -50,7 +50,9 @@ def checkpoint_content():
         "dropout": 0.5,
     }
     config = {
-        **dict.fromkeys(("preset", "body", "trainer"), {}),
+        "preset": {},
+        "body": {},
+        "trainer": {},
         "model": net,
         "module": {"_target_": "ljn.modules.joint_detector.JointDetector", "net": dict(net)},
         "data": {"camera": {"_target_": "ljn.geometry.camera.Camera", **CAMERA}},
@@ -358,6 +360,16 @@ def test_a_checkpoint_of_odd_content_is_refused(edit, message, tmp_path):
     with pytest.raises(ValueError, match=rf"ckpt_path: '.*tiny\.ckpt'.*{message}") as refusal:
         load_module(tmp_path / "tiny.ckpt", JointDetector)
     check_message(refusal.value)
+
+
+def test_weights_that_pytorch_would_leave_to_chance_are_refused(tmp_path):
+    torch.save(checkpoint_content(), tmp_path / "tiny.ckpt")
+    content = bytearray((tmp_path / "tiny.ckpt").read_bytes())
+    entry = content.rindex(b"tiny/data/1") - 46  # of the central directory
+    content[entry + 38] |= 0x10  # a folder, in the attributes
+    (tmp_path / "tiny.ckpt").write_bytes(content)
+    with pytest.raises(ValueError, match="attributes of files, which PyTorch does not write"):
+        load_weights(tmp_path / "tiny.ckpt")
 
 
 def test_objects_in_a_checkpoint_are_refused_without_advice_to_load_them(tmp_path):

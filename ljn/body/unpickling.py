@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ljn.reading import check_pickle
+from ljn.reading import brief, check_pickle
 
 _MAX_LEVELS = 5
 """Of arrays made from arrays; official files have three."""
@@ -164,7 +164,7 @@ class _DataUnpickler(pickle.Unpickler):
         if package[:2] == ("scipy", "sparse"):
             return _SPARSE.get(name[:3], _Record)
         raise ForbiddenContentError(
-            f"names {module}.{name}, which a SMPL model never needs: nothing of the file was run. "
+            f"names {brief(f'{module}.{name}')}, which a SMPL model never needs: nothing of the file was run. "
             "It may not be a SMPL model; get it from a source you trust."
         )
 
