@@ -2,40 +2,62 @@
 
 from torch import Tensor
 
+LOSSES = ("squared", "distance")
+"""`squared` distances, Eq. 3.6 and 3.7, or the `distance` itself, which far-off joints and vertices govern less."""
+_SMALL = 1e-8  # m^2, so that the distance has a gradient at 0
 
-def joint_loss(pred: Tensor, target: Tensor) -> Tensor:
-    """Return Eq. 3.6, the squared distances summed over a sample's joints, averaged over the batch.
 
-    The average is ours: the thesis writes the loss of one sample.
+def check_loss(loss: str) -> str:
+    """`loss`, if it is one of `LOSSES`; else a `ValueError`."""
+    if loss not in LOSSES:
+        raise ValueError(f"loss: expected one of {', '.join(LOSSES)}, got '{loss}'")
+    return loss
+
+
+def joint_loss(pred: Tensor, target: Tensor, loss: str = "squared") -> Tensor:
+    """Return Eq. 3.6, the squared distances summed over a sample's joints, averaged over the batch; or the distances'.
+
+    The average, and the sum over steps, are ours: the thesis writes the loss of one sample and one step.
 
     Args:
-        pred: `(..., K, 3)`, metres.
-        target: `(..., K, 3)`, metres, the same frame.
+        pred: `(T, B, K, 3)`, metres: the joints after each of T steps.
+        target: `(B, K, 3)`, metres, the same frame.
+        loss: One of `LOSSES`.
 
     Returns:
-        Scalar, square metres.
+        Scalar, square metres or metres.
     """
-    if pred.shape != target.shape:
+    if pred.ndim != 4 or pred.shape[1:] != target.shape:
         raise ValueError(
-            f"pred and target must be of the same shape, got {tuple(pred.shape)} and {tuple(target.shape)}"
+            f"expected pred (T, B, K, 3) and target (B, K, 3), got {tuple(pred.shape)} and {tuple(target.shape)}"
         )
-    return (pred - target).square().sum((-2, -1)).mean()
+    if loss == "squared":
+        return (pred - target).square().sum((-2, -1)).mean(-1).sum()
+    return _distances(pred - target).sum(-1).mean(-1).sum()
 
 
-def mesh_loss(pred: Tensor, target: Tensor) -> Tensor:
-    """Return Eq. 3.7, the mean squared distance of the vertices, summed over iterations, averaged over the batch.
+def _distances(offset: Tensor) -> Tensor:
+    return (offset.square().sum(-1) + _SMALL).sqrt()
+
+
+def mesh_loss(pred: Tensor, target: Tensor, loss: str = "squared") -> Tensor:
+    """Return Eq. 3.7, the mean squared distance of the vertices, summed over iterations, averaged over the batch; or
+    the mean distance.
 
     The average over the batch is ours: the thesis writes the loss of one sample.
 
     Args:
         pred: `(T, B, V, 3)`, metres, body frame: the mesh after each of T iterations.
         target: `(B, V, 3)`, metres, body frame.
+        loss: One of `LOSSES`.
 
     Returns:
-        Scalar, square metres.
+        Scalar, square metres or metres.
     """
     if pred.ndim != 4 or pred.shape[1:] != target.shape:
         raise ValueError(
             f"expected pred (T, B, V, 3) and target (B, V, 3), got {tuple(pred.shape)} and {tuple(target.shape)}"
         )
-    return (pred - target).square().sum(-1).mean((1, 2)).sum()
+    offset = pred - target
+    distances = offset.square().sum(-1) if loss == "squared" else _distances(offset)
+    return distances.mean((1, 2)).sum()

@@ -1,32 +1,29 @@
 import pytest
 import torch
 
-from ljn.losses import joint_loss, mesh_loss
+from ljn.losses import LOSSES, check_loss, joint_loss, mesh_loss
 
 
-def test_joint_loss_sums_over_joints_and_averages_over_the_batch():
+@pytest.mark.parametrize("loss", LOSSES)
+def test_joint_loss_sums_over_steps_and_joints_and_averages_over_the_batch(loss):
     generator = torch.Generator().manual_seed(0)
-    pred, target = torch.randn(2, 5, 24, 3, generator=generator, dtype=torch.float64)
+    pred = torch.randn(2, 5, 24, 3, generator=generator, dtype=torch.float64)
+    target = torch.randn(5, 24, 3, generator=generator, dtype=torch.float64)
     expected = 0.0
-    for sample in range(5):
-        for joint in range(24):
-            expected += sum((p - t) ** 2 for p, t in zip(pred[sample, joint], target[sample, joint])) / 5
-    torch.testing.assert_close(joint_loss(pred, target), expected)
+    for step in range(2):
+        for sample in range(5):
+            for joint in range(24):
+                square = sum((p - t) ** 2 for p, t in zip(pred[step, sample, joint], target[sample, joint]))
+                expected += (square if loss == "squared" else square**0.5) / 5
+    torch.testing.assert_close(joint_loss(pred, target, loss), expected)
+    assert torch.autograd.gradcheck(joint_loss, (pred.requires_grad_(), target, loss))
 
 
-def test_joint_loss_of_every_joint_one_decimetre_off():
-    target = torch.zeros(4, 24, 3)
-    assert joint_loss(target + torch.tensor([0.0, 0.1, 0.0]), target) == pytest.approx(24 * 0.01)
-
-
-def test_joint_loss_gradient():
-    pred, target = torch.randn(2, 3, 24, 3, dtype=torch.float64)
-    assert torch.autograd.gradcheck(joint_loss, (pred.requires_grad_(), target))
-
-
-def test_joint_loss_rejects_shapes_that_would_broadcast():
-    with pytest.raises(ValueError, match=r"same shape, got \(2, 24, 3\) and \(24, 3\)"):
+def test_losses_reject_shapes_that_would_broadcast_and_unknown_kinds():
+    with pytest.raises(ValueError, match=r"got \(2, 24, 3\) and \(24, 3\)"):
         joint_loss(torch.zeros(2, 24, 3), torch.zeros(24, 3))
+    with pytest.raises(ValueError, match="loss: expected one of squared, distance, got 'l1'"):
+        check_loss("l1")
 
 
 def test_mesh_loss_averages_over_vertices_and_samples_and_sums_over_iterations():

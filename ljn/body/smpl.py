@@ -1,6 +1,7 @@
 """The SMPL layer (section 3.1): pose and shape in, vertices and joints out."""
 
 from collections.abc import Callable, Sequence
+from copy import copy
 from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
@@ -93,6 +94,22 @@ class SMPL(nn.Module):
             gender: A key of `GENDERS`.
         """
         return cls(load_body_model(path, gender))
+
+    def on_vertices(self, vertices: Tensor) -> "SMPL":
+        """The layer that gives some of the vertices alone, and the same joints: for losses, where all are too many.
+
+        Args:
+            vertices: `(U,)` long, their indices.
+        """
+        layer = copy(self)
+        layer._buffers = dict(self._buffers)
+        layer.num_vertices = len(vertices)
+        layer._buffers["_v_template"] = self._v_template.unflatten(-1, (3, -1))[..., vertices].flatten(-2)
+        directions = self._directions.unflatten(-1, (3, -1))[..., vertices]
+        layer._buffers["_directions"] = directions.flatten(-2).contiguous()
+        layer._buffers["_weights"] = self._weights[..., vertices].contiguous()
+        layer._buffers["faces"] = self.faces[:0]
+        return layer
 
     def forward(self, pose: Tensor, betas: Tensor, gender: Tensor | None = None) -> SMPLOutput:
         """Posed vertices and joints.

@@ -104,6 +104,7 @@ def observe(
             raise ValueError("keypoints: expected those of the 24 joints, which this network takes, got none")
         corner = np.array([camera.width - 1, camera.height - 1], np.float32)
         made["keypoints"] = np.asarray(keypoints, np.float32).clip(0, corner)
+    if "initial_joints" in takes:
         made["initial_joints"] = lift_keypoints(made["keypoints"], depth, camera)
     return made
 

@@ -64,7 +64,11 @@ class StageModule(LightningModule):
 
     def forward(self, batch: Mapping[str, Tensor]) -> Any:
         """What the network makes of a batch, of which it takes `takes`."""
-        return self.net(*(batch[name] for name in self.takes))
+        return self.net(*self.observation(batch))
+
+    def observation(self, batch: Mapping[str, Any]) -> tuple[Tensor, ...]:
+        """What the network takes of a batch, in the order of its arguments."""
+        return tuple(batch[name] for name in self.takes)
 
     @property
     def body_hashes(self) -> tuple[str, ...]:

@@ -1,12 +1,15 @@
 """Stage 1 as a LightningModule: training, validation and test of a joint detector."""
 
+from collections.abc import Callable
 from typing import Any, ClassVar
 
 from lightning.pytorch.trainer.states import TrainerFn
 from torch import Tensor, nn
+from torch.optim import Optimizer
+from torch.optim.lr_scheduler import LRScheduler
 
 from ljn.data import Batch
-from ljn.losses import joint_loss
+from ljn.losses import check_loss, joint_loss
 from ljn.metrics import JointMetrics
 from ljn.modules.base import StageModule
 from ljn.nets.detector import Detector
@@ -14,7 +17,14 @@ from ljn.nets.yardsticks import Yardstick
 
 
 class JointDetector(StageModule):
-    """A joint detector (`net`: a `Detector`) with its loss (Eq. 3.6), optimizer and metrics; see `StageModule`."""
+    """A joint detector (`net`: a `Detector`) with its loss (Eq. 3.6), optimizer and metrics; see `StageModule`.
+
+    Args:
+        net: The network.
+        optimizer: See `StageModule`.
+        scheduler: See `StageModule`.
+        loss: One of `ljn.losses.LOSSES`.
+    """
 
     stage = "detector"
     metrics = JointMetrics
@@ -23,6 +33,16 @@ class JointDetector(StageModule):
     stored = ("initial_joints", "pred_joints")
     net: Detector
 
+    def __init__(
+        self,
+        net: Detector,
+        optimizer: Callable[..., Optimizer] | None = None,
+        scheduler: Callable[[Optimizer], LRScheduler] | None = None,
+        loss: str = "squared",
+    ) -> None:
+        super().__init__(net, optimizer, scheduler)
+        self.kind_of_loss = check_loss(loss)
+
     @property
     def is_root_relative(self) -> bool:
         """See `StageModule.is_root_relative`."""
@@ -30,7 +50,8 @@ class JointDetector(StageModule):
 
     def loss(self, batch: Batch) -> Tensor:
         """See `StageModule.loss`."""
-        return joint_loss(self(batch), batch["joints"])
+        estimates = self.net.estimates(*self.observation(batch))
+        return joint_loss(estimates, batch["joints"], self.kind_of_loss)
 
     def evaluate(self, batch: Batch, metrics: Any) -> dict[str, Tensor]:
         """See `StageModule.evaluate`; predicts `pred_joints` `(B, 24, 3)`, metres, camera frame."""

@@ -2,10 +2,10 @@
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
 
@@ -14,7 +14,7 @@ from ljn.body.skeleton import ROOT
 from ljn.data import Batch
 from ljn.geometry.camera import place_at_root
 from ljn.geometry.rotations import rotmat_to_rotvec
-from ljn.losses import mesh_loss
+from ljn.losses import check_loss, mesh_loss
 from ljn.metrics import MeshMetrics
 from ljn.modules.base import StageModule
 from ljn.nets.body_network import BodyNetwork
@@ -33,6 +33,9 @@ class MeshRegressor(StageModule):
         body_path: SMPL-format file or folder; see `ljn.body.load_body_models`.
         genders: Genders of the records.
         predicted: Gender of the body that predictions are meshes of.
+        loss: One of `ljn.losses.LOSSES`.
+        loss_vertices: Vertices that the loss is taken over, spread evenly over the body's; None for all.
+        joint_weight: Weight of the same loss of the mesh's joints, beside the vertices'.
     """
 
     stage = "mesh"
@@ -50,10 +53,26 @@ class MeshRegressor(StageModule):
         body_path: str | Path | None = None,
         genders: Sequence[str] = ("female", "male"),
         predicted: str = "neutral",
+        loss: str = "squared",
+        loss_vertices: int | None = None,
+        joint_weight: float = 0.0,
     ) -> None:
         super().__init__(net, optimizer, scheduler)
+        self.kind_of_loss = check_loss(loss)
+        self.joint_weight = joint_weight
         self.body = SMPL(load_body_models(body_path, [predicted]))
         self.target_body = SMPL(load_body_models(body_path, list(genders)))
+        net.use_body(self.body)
+        self.loss_bodies = nn.ModuleList([self.body, self.target_body])
+        if loss_vertices is not None:
+            if not 1 <= loss_vertices <= self.body.num_vertices:
+                raise ValueError(
+                    f"loss_vertices: expected 1 to {self.body.num_vertices}, got {loss_vertices}; null takes all"
+                )
+            chosen = torch.linspace(0, self.body.num_vertices - 1, loss_vertices).long()
+            self.loss_bodies = nn.ModuleList(
+                body.on_vertices(chosen) for body in (self.body, self.target_body)
+            )
 
     @property
     def body_hashes(self) -> tuple[str, ...]:
@@ -67,8 +86,14 @@ class MeshRegressor(StageModule):
 
     def loss(self, batch: Batch) -> Tensor:
         """See `StageModule.loss`."""
-        rotmats, betas = self(batch)
-        return mesh_loss(self.body.from_rotmats(rotmats, betas).vertices, self.target(batch)[0])
+        body, target_body = cast(list[SMPL], list(self.loss_bodies))
+        vertices, joints = body.from_rotmats(*self(batch))
+        with torch.no_grad():
+            target_vertices, target_joints = target_body(batch["pose"], batch["betas"], batch["gender"])
+        loss = mesh_loss(vertices, target_vertices, self.kind_of_loss)
+        if self.joint_weight:
+            loss = loss + self.joint_weight * mesh_loss(joints, target_joints, self.kind_of_loss)
+        return loss
 
     def evaluate(self, batch: Batch, metrics: Any) -> dict[str, Tensor]:
         """See `StageModule.evaluate`.

@@ -7,6 +7,7 @@ from typing import NamedTuple, cast
 import torch
 from torch import Tensor, nn
 
+from ljn.body import SMPL
 from ljn.body.files import NUM_BETAS
 from ljn.body.skeleton import LEVELS, NUM_JOINTS, PARENTS, ROOT
 from ljn.geometry.rotations import BODY_TO_OPENGL, rot6d_to_rotmat, rotvec_to_rotmat
@@ -31,7 +32,20 @@ class BodyEstimate(NamedTuple):
 
 
 class BodyNetwork(nn.Module, ABC):
-    """Base of the mesh regressors' networks: an initial estimate from the global feature, then residuals.
+    """Base of the mesh regressors' networks: an observation in, a `BodyEstimate` out.
+
+    Attributes:
+        takes: What of an observation it is called with: keys of a batch, in the order of its arguments.
+    """
+
+    takes: tuple[str, ...]
+
+    def use_body(self, body: SMPL) -> None:
+        """Take from the predicted body what the network needs to know of it; most need nothing."""
+
+
+class CloudBodyNetwork(BodyNetwork):
+    """Base of the thesis's networks: an initial estimate from the cloud's global feature, then residuals.
 
     The root's rotation is held in the axes of R (Eq. 3.5), where a body that faces the camera is not turned at all
     and the cut at a half turn lies behind it.
@@ -95,7 +109,7 @@ class BodyNetwork(nn.Module, ABC):
         """The estimates of all iterations, from the feature `(B, C)`, pose `(B, 24, A)` and betas `(B, 10)`."""
 
 
-class HierarchicalBodyNetwork(BodyNetwork):
+class HierarchicalBodyNetwork(CloudBodyNetwork):
     """LJN_pse: joint by joint from the root down, then the shape.
 
     Regressor i gives a residual to theta_i from theta'_i, the refined theta_j of all ancestors j of joint i, beta'
@@ -103,10 +117,10 @@ class HierarchicalBodyNetwork(BodyNetwork):
     tree have equally many ancestors and are refined at once.
 
     Args:
-        trunk: See `BodyNetwork`.
-        num_iterations: See `BodyNetwork`.
-        rotation: See `BodyNetwork`.
-        head_channels: See `BodyNetwork`.
+        trunk: See `CloudBodyNetwork`.
+        num_iterations: See `CloudBodyNetwork`.
+        rotation: See `CloudBodyNetwork`.
+        head_channels: See `CloudBodyNetwork`.
         regressor_channels: Hidden widths of every regressor.
         passes_ancestors: Whether a regressor sees its ancestors' rotations (off: the ablation "single").
     """
@@ -138,7 +152,7 @@ class HierarchicalBodyNetwork(BodyNetwork):
         )
 
     def refine(self, feature: Tensor, pose: Tensor, betas: Tensor) -> list[tuple[Tensor, Tensor]]:
-        """See `BodyNetwork.refine`."""
+        """See `CloudBodyNetwork.refine`."""
         levels = cast(list[JointRegressors], list(self.joint_regressors))
         shared = [regressors.share(feature) for regressors in levels]
         estimates = []
@@ -204,14 +218,14 @@ class JointRegressors(nn.Module):
         return pose + self.rest(self.first_activation(hidden)).transpose(0, 1)
 
 
-class DirectBodyNetwork(BodyNetwork):
+class DirectBodyNetwork(CloudBodyNetwork):
     """The basic model (section 3.4.2, Fig. 3.9): one perceptron regresses all residuals of an iteration.
 
     Args:
-        trunk: See `BodyNetwork`.
-        num_iterations: See `BodyNetwork`.
-        rotation: See `BodyNetwork`.
-        head_channels: See `BodyNetwork`.
+        trunk: See `CloudBodyNetwork`.
+        num_iterations: See `CloudBodyNetwork`.
+        rotation: See `CloudBodyNetwork`.
+        head_channels: See `CloudBodyNetwork`.
         regressor_channels: Hidden widths of the regressor.
     """
 
@@ -230,7 +244,7 @@ class DirectBodyNetwork(BodyNetwork):
         )
 
     def refine(self, feature: Tensor, pose: Tensor, betas: Tensor) -> list[tuple[Tensor, Tensor]]:
-        """See `BodyNetwork.refine`."""
+        """See `CloudBodyNetwork.refine`."""
         estimates = []
         for _ in range(self.num_iterations):
             residual = self.regressor(torch.cat([feature, pose.flatten(1), betas], -1))

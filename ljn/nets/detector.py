@@ -22,8 +22,12 @@ class Detector(nn.Module, ABC):
         is_root_relative: Whether only its joints' positions beside the root mean something.
     """
 
-    takes: ClassVar[tuple[str, ...]]
+    takes: tuple[str, ...]
     is_root_relative: ClassVar[bool] = False
+
+    def estimates(self, *observation: Tensor) -> Tensor:
+        """Joints `(T, B, 24, 3)` after each of T steps, the last one those of a call: all are trained."""
+        return self(*observation)[None]
 
 
 class CloudDetector(Detector):

@@ -3,10 +3,13 @@
 import math
 from collections.abc import Sequence
 from itertools import pairwise
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
+
+LayerT = TypeVar("LayerT", bound=Any)
 
 
 def perceptron(channels: Sequence[int], last_activation: bool = True) -> nn.Sequential:
@@ -21,6 +24,23 @@ def perceptron(channels: Sequence[int], last_activation: bool = True) -> nn.Sequ
         if last_activation or number < len(channels) - 1:
             layers.append(nn.PReLU())
     return nn.Sequential(*layers)
+
+
+def initialise(layer: LayerT, slope: float = 0.0, scale: float = 1.0) -> LayerT:
+    """Kaiming's initialisation: what comes out is as large as what went in, after a (leaky) ReLU of `slope`.
+
+    Args:
+        layer: With `weight` `(out, in)`, `(K, out, in)` or `(out, in, kh, kw)`, and `bias`, which becomes zero.
+        slope: Of the activation on its negative side: 0.25 for a PReLU, 0 for ReLU and GELU.
+        scale: Factor of the weights; a small one for last layers, which then start near their bias.
+
+    Returns:
+        The layer.
+    """
+    fan_in = layer.weight[0].numel() if layer.weight.ndim == 4 else layer.weight.shape[-1]
+    nn.init.normal_(layer.weight, 0.0, scale * math.sqrt(2 / (1 + slope**2) / fan_in))
+    nn.init.zeros_(layer.bias)
+    return layer
 
 
 class StackedLinear(nn.Module):

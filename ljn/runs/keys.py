@@ -74,7 +74,11 @@ KEYS: dict[str, Key] = {
     "body": Key.THROUGH | Key.CHANGEABLE,
     "model": _MODEL,
     "module": _MODEL,
-    **_rows("module", _MODEL, "_target_ _convert_ net optimizer scheduler genders predicted"),
+    **_rows(
+        "module",
+        _MODEL,
+        "_target_ _convert_ net optimizer scheduler genders predicted loss loss_vertices joint_weight",
+    ),
     **_rows("module", Key.THROUGH | Key.ONE_STAGE, "body_path"),
     "data": _DATA,
     **_rows(
