@@ -57,17 +57,21 @@ def draw_prediction(prediction: Prediction, depth: np.ndarray, camera: Camera) -
 
 def _draw_keypoints(axis: "Axes", prediction: Prediction, depth: np.ndarray) -> None:
     axis.imshow(np.where(depth > 0, depth, np.nan), cmap="viridis")
-    keypoints, is_filled = prediction.keypoints, prediction.confidences == 0
-    axis.plot(*bone_lines(keypoints).T, color="white", lw=0.6)
-    for chosen, colour in ((~is_filled, _PREDICTED), (is_filled, _FILLED)):
-        axis.scatter(keypoints[chosen, 0], keypoints[chosen, 1], s=9, c=colour, zorder=3)
+    keypoints = prediction.keypoints
+    if keypoints is not None:
+        is_filled = prediction.confidences == 0
+        axis.plot(*bone_lines(keypoints).T, color="white", lw=0.6)
+        for chosen, colour in ((~is_filled, _PREDICTED), (is_filled, _FILLED)):
+            axis.scatter(keypoints[chosen, 0], keypoints[chosen, 1], s=9, c=colour, zorder=3)
     _crop(axis, depth > 0, keypoints)
     axis.set_title("depth and 2D keypoints", fontsize=9, loc="left")
 
 
-def _crop(axis: "Axes", is_shown: np.ndarray, pixels: np.ndarray) -> None:
-    """Leave of an image what is shown `(H, W)` and the pixels `(K, 2)`, with a border."""
-    shown = np.concatenate([np.argwhere(is_shown)[:, ::-1], pixels])
+def _crop(axis: "Axes", is_shown: np.ndarray, pixels: np.ndarray | None) -> None:
+    """Leave of an image what is shown `(H, W)` and the pixels `(K, 2)`, if there are any, with a border."""
+    shown = np.argwhere(is_shown)[:, ::-1]
+    if pixels is not None:
+        shown = np.concatenate([shown, pixels])
     low, high = shown.min(0) - 5, shown.max(0) + 5
     axis.set_xlim(low[0], high[0])
     axis.set_ylim(high[1], low[1])
@@ -79,6 +83,8 @@ def _draw_skeletons(axis: "Axes", prediction: Prediction, horizontal: int) -> No
     points = prediction.points
     axis.scatter(points[:, horizontal], points[:, 1], s=2, c="#b9bec6", linewidths=0)
     for joints, colour in ((prediction.initial_joints, _INITIAL), (prediction.joints, _PREDICTED)):
+        if joints is None:
+            continue
         bones = bone_lines(joints)
         axis.plot(bones[:, horizontal], bones[:, 1], color=colour, lw=1.6, solid_capstyle="round")
     axis.set_aspect("equal")

@@ -27,23 +27,24 @@ class Prediction:
 
     Attributes:
         joints: `(24, 3)`, the joint detector's.
+        points: `(N, 6)`, the cloud: position and normal.
         initial_joints: `(24, 3)`, the keypoints lifted with the depth image.
         keypoints: `(24, 2)`, those of the SMPL joints, pixels.
         confidences: `(24,)`, the keypoints' own; 0 where a keypoint was filled in.
-        points: `(N, 6)`, the detector's cloud: position and normal.
         vertices: `(V, 3)`, the mesh, its root joint at the detector's (Eq. 4.1-4.2).
         pose: `(72,)` axis-angle, radians; the first three turn SMPL's rest frame into body world, as in `Batch`.
         betas: `(10,)`.
         faces: `(F, 3)` int64, vertex indices; of a batch, too.
 
-    Without a mesh regressor, `vertices`, `pose`, `betas` and `faces` are None.
+    Without keypoints, `initial_joints`, `keypoints` and `confidences` are None; without a mesh regressor, `vertices`,
+    `pose`, `betas` and `faces`.
     """
 
     joints: np.ndarray
-    initial_joints: np.ndarray
-    keypoints: np.ndarray
-    confidences: np.ndarray
     points: np.ndarray
+    initial_joints: np.ndarray | None = None
+    keypoints: np.ndarray | None = None
+    confidences: np.ndarray | None = None
     vertices: np.ndarray | None = None
     pose: np.ndarray | None = None
     betas: np.ndarray | None = None
@@ -86,11 +87,11 @@ class ObservedFrame(NamedTuple):
     depth: np.ndarray
     detector: Observation
     regressor: Observation | None
-    confidences: np.ndarray
+    confidences: np.ndarray | None
 
 
 class Pipeline:
-    """Finds a person's joints and mesh in a depth image, given the person's 2D keypoints.
+    """Finds a person's joints and mesh in a depth image; from the person's 2D keypoints, where the detector takes them.
 
     Each stage's observation is made as in its training, by the recipe that its checkpoint carries.
 
@@ -144,14 +145,15 @@ class Pipeline:
             )
         return cls(detector, _stage(module.to(device), mesh_checkpoint))
 
-    def __call__(self, depth: Any, camera: Camera, keypoints: Any, mask: Any = None) -> Prediction:
+    def __call__(self, depth: Any, camera: Camera, keypoints: Any = None, mask: Any = None) -> Prediction:
         """Predict from one image, or from a batch of one camera's images.
 
         Args:
             depth: `(H, W)` or `(B, H, W)`: floating-point metres, or integer millimetres; 0 where nothing was
                 measured.
             camera: The camera of the images.
-            keypoints: See `smpl_keypoints`; of a batch, one such value for each image.
+            keypoints: See `smpl_keypoints`; of a batch, one such value for each image. None for a detector that takes
+                none.
             mask: `(H, W)` or `(B, H, W)`, not 0 on the person; None where depth is 0 everywhere else already.
 
         Raises:
@@ -163,6 +165,7 @@ class Pipeline:
         if len(depth) == 0:
             raise ValueError("depth: expected at least one image, got a batch of none")
         masks = [None] * len(depth) if mask is None else mask
+        keypoints = [None] * len(depth) if keypoints is None else keypoints
         if not len(depth) == len(keypoints) == len(masks):
             raise ValueError(
                 f"depth, keypoints, mask: expected one of each for every image, got {len(depth)} images, "
@@ -176,44 +179,61 @@ class Pipeline:
                 raise ValueError(f"image {number} of the batch: {error}") from error
         return self.predict(observations)
 
-    def observe(self, depth: Any, camera: Camera, keypoints: Any, mask: Any = None) -> ObservedFrame:
+    def observe(self, depth: Any, camera: Camera, keypoints: Any = None, mask: Any = None) -> ObservedFrame:
         """Check one image's input and observe it for each stage; arguments as in a call."""
         metres = body_depth(depth, camera, mask)
-        named = smpl_keypoints(keypoints)
-        check_place(named, metres, camera)
+        detector = self.detector.module
+        named = None
+        if keypoints is not None:
+            named = smpl_keypoints(keypoints)
+            check_place(named, metres, camera)
+        elif "initial_joints" in detector.takes:
+            raise ValueError(
+                "keypoints: expected the person's 2D keypoints, which this joint detector takes, got none; give them, "
+                "or a detector that was trained without: experiment=detector/cascade_no_keypoints"
+            )
 
         def observed(stage: Stage, *more: str) -> Observation:
-            rng = np.random.default_rng(_SEED)
-            takes = {*stage.module.takes, *more}
-            return observe(metres, camera, named.positions, stage.recipe, takes, rng)
+            takes = {*stage.module.takes, *more} - {"initial_joints"}
+            if named is not None and stage is self.detector:
+                takes |= {"initial_joints"}
+            rng, positions = np.random.default_rng(_SEED), None if named is None else named.positions
+            return observe(metres, camera, positions, stage.recipe, takes, rng)
 
         return ObservedFrame(
             metres,
-            observed(self.detector, "points", "initial_joints"),
+            observed(self.detector, "points"),
             observed(self.regressor) if self.regressor else None,
-            named.confidences,
+            None if named is None else named.confidences,
         )
 
     @torch.inference_mode()
     def predict(self, frames: Sequence[ObservedFrame]) -> Prediction:
-        """Run the networks on a batch of at least one frame."""
+        """Run the networks on a batch of at least one frame, all with keypoints or all without."""
         detector = self.detector.module
         seen = stack_observations([frame.detector for frame in frames])
         joints = detector(_on(detector.device, seen))
-        inputs = [seen[name].numpy() for name in ("initial_joints", "keypoints")]
-        inputs += [np.stack([frame.confidences for frame in frames]), seen["points"].numpy()]
-        if self.regressor is None:
-            return Prediction(joints.cpu().numpy(), *inputs)
-        regressor = self.regressor.module
-        seen = stack_observations([frame.regressor for frame in frames if frame.regressor is not None])
-        rotmats, betas = (
-            values[-1] for values in regressor(_on(regressor.device, seen) | {"initial_joints": joints})
+        arrays = {"points": seen["points"]}
+        arrays |= {name: seen[name] for name in ("initial_joints", "keypoints") if name in seen}
+        confidences = [frame.confidences for frame in frames if frame.confidences is not None]
+        if confidences:
+            arrays["confidences"] = torch.from_numpy(np.stack(confidences))
+        if self.regressor is not None:
+            regressor = self.regressor.module
+            seen = stack_observations([frame.regressor for frame in frames if frame.regressor is not None])
+            rotmats, betas = (
+                values[-1] for values in regressor(_on(regressor.device, seen) | {"initial_joints": joints})
+            )
+            body = regressor.body.from_rotmats(rotmats, betas)
+            arrays |= {
+                "vertices": place_at_root(body.vertices, body.joints[:, ROOT], joints[:, ROOT]),
+                "pose": rotmat_to_rotvec(rotmats).flatten(-2),
+                "betas": betas,
+                "faces": regressor.body.faces,
+            }
+        return Prediction(
+            joints.cpu().numpy(), **{name: value.cpu().numpy() for name, value in arrays.items()}
         )
-        body = regressor.body.from_rotmats(rotmats, betas)
-        vertices = place_at_root(body.vertices, body.joints[:, ROOT], joints[:, ROOT])
-        pose = rotmat_to_rotvec(rotmats).flatten(-2)
-        outputs = (vertices, pose, betas, regressor.body.faces)
-        return Prediction(joints.cpu().numpy(), *inputs, *(output.cpu().numpy() for output in outputs))
 
 
 def _on(device: torch.device, tensors: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
