@@ -8,8 +8,8 @@ def test_a_picture_is_drawn_with_and_without_a_mesh(pipeline, given, kinect, tmp
     found = pipeline(given[0], kinect, given[1])
     depth = body_depth(given[0], kinect)
     draw_prediction(found, depth, kinect).savefig(tmp_path / "mesh.png")
-    found = type(found)(found.joints, found.initial_joints, found.keypoints, found.confidences, found.points)
-    draw_prediction(found, depth, kinect).savefig(tmp_path / "joints.png")
+    alone = type(found)(found.joints, found.points)  # neither keypoints nor a mesh
+    draw_prediction(alone, depth, kinect).savefig(tmp_path / "joints.png")
     assert (tmp_path / "mesh.png").stat().st_size > (tmp_path / "joints.png").stat().st_size > 20_000
 
 
