@@ -53,9 +53,7 @@ class PyRender(Renderer):
             scene.add(gl_camera, pose=_GL_FROM_CAMERA)
             # SEG turns multisampling off, which would return the depth of a sample beside the pixel's centre.
             image[:] = renderer.render(
-                scene,
-                flags=flags.DEPTH_ONLY | flags.SEG,
-                seg_node_map={node: (255, 255, 255)},
+                scene, flags=flags.DEPTH_ONLY | flags.SEG, seg_node_map={node: (255, 255, 255)}
             )
         return torch.from_numpy(depth)
 

@@ -36,9 +36,7 @@ def shade_mesh(
     for corner in range(3):
         np.add.at(normals, faces[:, corner], face_normals)
     seen = get_renderer("zbuffer").fragments(
-        torch.from_numpy(np.ascontiguousarray(vertices, dtype=np.float64))[None],
-        torch.tensor(faces),
-        camera,
+        torch.from_numpy(np.ascontiguousarray(vertices, dtype=np.float64))[None], torch.tensor(faces), camera
     )
     face_ids, shares = seen.face_ids[0].numpy(), seen.barycentrics[0].numpy()
     normal = (normals[faces[face_ids]] * shares[..., None]).sum(-2)

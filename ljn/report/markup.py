@@ -31,11 +31,7 @@ def section(name: str, title: str, content: str, style: str = "") -> str:
 
 
 def table(
-    label: str,
-    head: Sequence[Sequence[str]],
-    *bodies: Sequence[str],
-    caption: str = "",
-    style: str = "",
+    label: str, head: Sequence[Sequence[str]], *bodies: Sequence[str], caption: str = "", style: str = ""
 ) -> str:
     """A table in a box of its own, which scrolls where the page is narrow, also from the keyboard.
 

@@ -300,13 +300,7 @@ TABLES: dict[str, Table] = {table.name: table for table in _ALL}
 """The tables by name: the thesis's, their cross evaluations and the demonstration's."""
 
 NUM_DATA: Mapping[str, Mapping[str, int]] = {
-    "train": {
-        "subjects": 115,
-        "sequences": 1_964,
-        "clips": 55_001,
-        "frames": 5_342_090,
-        "samples": 60_000,
-    },
+    "train": {"subjects": 115, "sequences": 1_964, "clips": 55_001, "frames": 5_342_090, "samples": 60_000},
     "val": {"samples": 5_000},
     "test": {"subjects": 30, "sequences": 703, "clips": 12_528, "frames": 1_194_662, "samples": 15_000},
 }

@@ -40,10 +40,7 @@ def end_on_signals() -> None:
         if last - before > _APART_S:
             raise Interruption(number)
 
-    for number, default in (
-        (signal.SIGTERM, signal.SIG_DFL),
-        (signal.SIGINT, signal.default_int_handler),
-    ):
+    for number, default in ((signal.SIGTERM, signal.SIG_DFL), (signal.SIGINT, signal.default_int_handler)):
         if signal.getsignal(number) == default:
             signal.signal(number, end)
 

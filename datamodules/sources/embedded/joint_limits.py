@@ -17,12 +17,7 @@ from torch import Tensor
 
 from ljn.body.kinematics import SIDES
 from ljn.body.skeleton import JOINT_INDEX
-from ljn.geometry.rotations import (
-    euler_to_rotmat,
-    rotmat_to_euler,
-    rotvec_to_rotmat,
-    swing_twist,
-)
+from ljn.geometry.rotations import euler_to_rotmat, rotmat_to_euler, rotvec_to_rotmat, swing_twist
 
 
 class Ranges(NamedTuple):

@@ -11,13 +11,7 @@ from datamodules.sources.embedded.families import FAMILIES
 from datamodules.sources.embedded.joint_limits import within_limits
 from datamodules.sources.embedded.penetration import fit_capsules, penetration
 from datamodules.sources.embedded.procedural import draw_poses
-from datamodules.sources.embedded.recombination import (
-    Donors,
-    Made,
-    jittered,
-    swapped_poses,
-    whole_poses,
-)
+from datamodules.sources.embedded.recombination import Donors, Made, jittered, swapped_poses, whole_poses
 from datamodules.sources.embedded.reference import REFERENCE_CAPSULES, REFERENCE_OFFSETS
 from ljn.body import BodyModel
 from ljn.body.kinematics import joint_offsets, without_heading, world_rotations
@@ -127,9 +121,7 @@ class PoseMixture:
         """Poses of the kinds or families that `labels` `(n,)` name, within joint limits, not yet tested."""
         n = len(labels)
         result = Made(
-            torch.empty(n, NUM_JOINTS, 3, 3, dtype=torch.float64),
-            np.empty(n, object),
-            np.empty(n, np.int64),
+            torch.empty(n, NUM_JOINTS, 3, 3, dtype=torch.float64), np.empty(n, object), np.empty(n, np.int64)
         )
         is_procedural = np.char.startswith(labels, _PROCEDURAL)
         for kind in KINDS:
