@@ -34,19 +34,12 @@ def new_figure(width: float, height: float) -> "Figure":
 
 
 class Sample(NamedTuple):
-    """What is drawn of a sample; camera frame, metres.
+    """What is drawn of a sample; camera frame, metres."""
 
-    Attributes:
-        points: `(N, 3)`.
-        joints: `(24, 3)`, the truth.
-        pred_joints: `(24, 3)`.
-        title: Text above it.
-    """
-
-    points: np.ndarray
-    joints: np.ndarray
-    pred_joints: np.ndarray
-    title: str
+    points: np.ndarray  # `(N, 3)`
+    joints: np.ndarray  # `(24, 3)`, the truth
+    pred_joints: np.ndarray  # `(24, 3)`
+    title: str  # text above it
 
 
 def draw_samples(samples: list[Sample], num_columns: int) -> "Figure":
@@ -128,19 +121,12 @@ def clouds(batch: Mapping[str, Tensor]) -> list[np.ndarray]:
 
 
 class MeshSample(NamedTuple):
-    """What is drawn of a mesh regressor's sample; camera frame, metres.
+    """What is drawn of a mesh regressor's sample; camera frame, metres."""
 
-    Attributes:
-        points: `(N, 3)`.
-        vertices: `(V, 3)`, the truth.
-        pred_vertices: `(V, 3)`.
-        title: Text above it.
-    """
-
-    points: np.ndarray
-    vertices: np.ndarray
-    pred_vertices: np.ndarray
-    title: str
+    points: np.ndarray  # `(N, 3)`
+    vertices: np.ndarray  # `(V, 3)`, the truth
+    pred_vertices: np.ndarray  # `(V, 3)`
+    title: str  # text above it
 
 
 def draw_meshes(samples: list[MeshSample], faces: np.ndarray, num_columns: int) -> "Figure":

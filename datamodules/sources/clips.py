@@ -12,15 +12,10 @@ from ljn.reading import READ_ERRORS, read_arrays, read_json, reason, shown
 
 
 class Clips(NamedTuple):
-    """Frames of motion clips.
+    """Frames of motion clips."""
 
-    Attributes:
-        poses: `(N, 72)` float32 axis-angle, radians, in SMPL's axes (y up, z forward).
-        clip: `(N,)` str, each frame's clip.
-    """
-
-    poses: np.ndarray
-    clip: np.ndarray
+    poses: np.ndarray  # `(N, 72)` float32 axis-angle, radians, in SMPL's axes (y up, z forward)
+    clip: np.ndarray  # `(N,)` str, each frame's clip
 
 
 def read_clips(path: Path) -> Clips:

@@ -15,30 +15,17 @@ FrameT = TypeVar("FrameT")
 
 
 class FrameImages(NamedTuple):
-    """What is known of one image; each part as `Pipeline` takes it.
+    """What is known of one image; each part as `Pipeline` takes it."""
 
-    Attributes:
-        depth: `(H, W)`.
-        keypoints: 2D keypoints.
-        mask: `(H, W)`; None for none.
-    """
-
-    depth: Any
+    depth: Any  # `(H, W)`
     keypoints: Any
-    mask: Any = None
+    mask: Any = None  # `(H, W)`; None for none
 
 
 class FrameFiles(NamedTuple):
-    """The files of one image.
+    """The files of one image."""
 
-    Attributes:
-        name: Names its outputs.
-        depth: Depth image.
-        keypoints: Keypoints.
-        mask: Mask of the person; None for none.
-    """
-
-    name: str
+    name: str  # names its outputs
     depth: Path
     keypoints: Path
     mask: Path | None
@@ -55,19 +42,12 @@ class FrameFiles(NamedTuple):
 
 
 class FrameResult(NamedTuple, Generic[FrameT]):
-    """What became of a frame: a prediction, or an error.
-
-    Attributes:
-        frame: The frame.
-        prediction: See `Pipeline`; None after an error.
-        depth: `(H, W)`, the body's, metres; None after an error.
-        error: What was wrong with it; None otherwise.
-    """
+    """What became of a frame: a prediction, or an error."""
 
     frame: FrameT
-    prediction: Prediction | None = None
-    depth: np.ndarray | None = None
-    error: Exception | None = None
+    prediction: Prediction | None = None  # see `Pipeline`; None after an error
+    depth: np.ndarray | None = None  # `(H, W)`, the body's, metres; None after an error
+    error: Exception | None = None  # what was wrong with it; None otherwise
 
 
 def predict_frames(

@@ -30,26 +30,17 @@ _AROUND = 0.1  # the same around the body's box
 
 
 class Taken(NamedTuple):
-    """Where a SMPL joint is taken from.
+    """Where a SMPL joint is taken from."""
 
-    Attributes:
-        keypoints: Names in the order; the mean of those that are known.
-        note: What it approximates.
-    """
-
-    keypoints: tuple[str, ...]
-    note: str
+    keypoints: tuple[str, ...]  # names in the order; the mean of those that are known
+    note: str  # what it approximates
 
 
 class Order(NamedTuple):
-    """A set of keypoints as detectors give it.
+    """A set of keypoints as detectors give it."""
 
-    Attributes:
-        names: Its keypoints, in order.
-        joints: For each SMPL joint that can be taken from it, from what. All other joints are filled in.
-    """
-
-    names: tuple[str, ...]
+    names: tuple[str, ...]  # its keypoints, in order
+    # for each SMPL joint that can be taken from it, from what. All other joints are filled in.
     joints: Mapping[str, Taken]
 
 

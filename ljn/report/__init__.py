@@ -15,17 +15,11 @@ __all__ = ["TABLES", "Report", "Results", "read_results", "write_report"]
 
 @dataclass(frozen=True)
 class Report:
-    """What is to be said of a sweep.
+    """A sweep's report, written and for a terminal."""
 
-    Attributes:
-        text: Its tables, for a terminal, with the failed runs by name.
-        has_failed: Whether any of its runs failed or left no result.
-        paths: The files that were written.
-    """
-
-    text: str
-    has_failed: bool
-    paths: tuple[Path, ...]
+    text: str  # its tables, for a terminal, with the failed runs by name
+    has_failed: bool  # whether any of its runs failed or left no result
+    paths: tuple[Path, ...]  # of the files that were written
 
 
 def write_report(directory: Path, is_final: bool = True) -> Report:

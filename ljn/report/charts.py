@@ -12,20 +12,12 @@ _LEFT, _RIGHT, _TOP, _BOTTOM = 54, 14, 14, 46
 
 @dataclass(frozen=True)
 class Series:
-    """A line.
-
-    Attributes:
-        label: What it is called.
-        points: x, y and half the length of y's error bar (None for none).
-        colour: Number of its colour.
-        is_dashed: Whether it is dashed and its markers are hollow.
-        has_markers: Whether its points are marked.
-    """
+    """A line of a chart."""
 
     label: str
-    points: tuple[tuple[float, float, float | None], ...]
+    points: tuple[tuple[float, float, float | None], ...]  # x, y, half the length of y's error bar
     colour: int = 0
-    is_dashed: bool = False
+    is_dashed: bool = False  # then its markers are hollow, too
     has_markers: bool = True
 
     @property

@@ -16,25 +16,14 @@ _SEED = 0
 
 @dataclass(frozen=True)
 class Cell:
-    """A number of a table, in its column's unit.
-
-    Attributes:
-        column: Its column.
-        label: Its row.
-        runs: Whose result it is, one for each seed.
-        metric: The metric that is shown; None where the row has no such value.
-        mean: Over seeds; None without a result.
-        sd: Standard deviation over seeds (one degree of freedom less); None of fewer than two.
-        num_seeds: How many there are.
-        thesis: The thesis's value.
-    """
+    """A number of a table, in its column's unit."""
 
     column: Column
-    label: str
-    runs: tuple[Run, ...]
-    metric: str | None
-    mean: float | None
-    sd: float | None
+    label: str  # of its row
+    runs: tuple[Run, ...]  # whose result it is, one for each seed
+    metric: str | None  # the metric that is shown; None where the row has no such value
+    mean: float | None  # over seeds; None without a result
+    sd: float | None  # standard deviation over seeds (one degree of freedom less); None of fewer than two
     num_seeds: int
     thesis: float | None
 
@@ -51,27 +40,19 @@ class Cell:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Two rows in one column.
-
-    Attributes:
-        column: The column.
-        better: Label of the row that the thesis's numbers, or else ours, put first.
-        worse: Label of the other one.
-        is_claim: Whether it is the thesis that puts it first.
-        is_adjacent: Whether no row of the thesis lies between the two.
-        lead: By how much the first is better in our runs, in the column's unit; negative where it is worse.
-        spread: Standard deviation of the lead over seeds; None where a row has fewer than two.
-        interval: 95 % interval of the lead over test samples, by a paired bootstrap; None where its values of the
-            same samples are not known for both.
-    """
+    """Two rows in one column."""
 
     column: Column
-    better: str
-    worse: str
-    is_claim: bool
-    is_adjacent: bool
-    lead: float
-    spread: float | None
+    better: str  # label of the row that the thesis's numbers, or else ours, put first
+    worse: str  # label of the other one
+    is_claim: bool  # whether it is the thesis that puts it first
+    is_adjacent: bool  # whether no row of the thesis lies between the two
+    lead: (
+        float  # by how much `better` is better in our runs, in the column's unit; negative where it is worse
+    )
+    spread: float | None  # standard deviation of the lead over seeds; None where a row has fewer than two
+    # 95 % interval of the lead over test samples, by a paired bootstrap; None where its values of the same samples are
+    # not known for both
     interval: tuple[float, float] | None
 
     @property

@@ -14,21 +14,13 @@ from ljn.runs.sweep import Run, Sweep, number_of, read_sweep, varying
 
 @dataclass(frozen=True)
 class RowResult:
-    """A row of a table.
-
-    Attributes:
-        row: What was asked for.
-        label: What it is called, with what tells it from other runs of its experiment.
-        runs: One for each seed.
-        cells: One for each column.
-        x: Its place on the table's axis: the value that its runs were configured with.
-    """
+    """A row of a table."""
 
     row: Row
-    label: str
-    runs: tuple[Run, ...]
-    cells: tuple[Cell, ...]
-    x: float | None
+    label: str  # what it is called, with what tells it from other runs of its experiment
+    runs: tuple[Run, ...]  # one for each seed
+    cells: tuple[Cell, ...]  # one for each column
+    x: float | None  # its place on the table's axis: the value that its runs were configured with
 
     @property
     def is_shared(self) -> bool:
@@ -55,18 +47,13 @@ class RowResult:
 
 @dataclass(frozen=True)
 class TableResult:
-    """A table with results.
-
-    Attributes:
-        table: What was asked for.
-        rows: Its rows.
-        comparisons: Between its rows: those that the thesis's numbers claim, or else the best row and the others.
-        num_claims: Of each column, how many pairs of rows the thesis puts in an order, with results or without.
-    """
+    """A table with results."""
 
     table: Table
     rows: tuple[RowResult, ...]
+    # between its rows: those that the thesis's numbers claim, or else the best row and the others
     comparisons: tuple[Comparison, ...]
+    # of each column, how many pairs of rows the thesis puts in an order, with results or without
     num_claims: tuple[int, ...]
 
     @property
@@ -80,15 +67,10 @@ class TableResult:
 
 @dataclass(frozen=True)
 class Results:
-    """A sweep's tables.
-
-    Attributes:
-        sweep: The sweep.
-        tables: Its tables; runs that belong to none of those asked for have one of their own.
-    """
+    """A sweep's tables."""
 
     sweep: Sweep
-    tables: tuple[TableResult, ...]
+    tables: tuple[TableResult, ...]  # runs that belong to none of those asked for have a table for themselves
 
     @property
     def lost(self) -> tuple[Run, ...]:

@@ -12,18 +12,12 @@ Values = Mapping[str, float | None]
 
 @dataclass(frozen=True)
 class Column:
-    """A column of a table.
+    """A column of a table."""
 
-    Attributes:
-        metric: Key in `metrics.json`, without `test/`.
-        label: What it is called.
-        unit: Its unit.
-        goal: Which values are better; None for what describes the input, where none is.
-    """
-
-    metric: str
+    metric: str  # key in `metrics.json`, without `test/`
     label: str
     unit: str
+    # which values are better; None for what describes the input, where none is
     goal: Literal["min", "max"] | None = None
 
     @property
@@ -34,73 +28,44 @@ class Column:
 
 @dataclass(frozen=True)
 class Axis:
-    """What a table varies, for its curves.
+    """What a table varies, for its curves."""
 
-    Attributes:
-        label: With its unit.
-        key: Where a run's configuration has the value, such as `data.observation.num_points`.
-    """
-
-    label: str
-    key: str
+    label: str  # with its unit
+    key: str  # where a run's configuration has the value, such as `data.observation.num_points`
 
 
 @dataclass(frozen=True)
 class Row:
-    """A row of a table.
-
-    Attributes:
-        label: What it is called.
-        experiment: Whose runs it shows; None for any finished run (what all of them share).
-        thesis: The thesis's values by column.
-        x: The thesis's place on the table's axis.
-        metrics: Columns where another metric of the run is shown; None: the row has no such value.
-        overrides: If given, only runs with exactly these.
-    """
+    """A row of a table."""
 
     label: str
-    experiment: str | None
-    thesis: Values = field(default_factory=dict)
-    x: float | None = None
+    experiment: str | None  # whose runs it shows; None for any finished run (what all of them share)
+    thesis: Values = field(default_factory=dict)  # by column
+    x: float | None = None  # the thesis's place on the table's axis
+    # columns where another metric of the run is shown; None: the row has no such value
     metrics: Mapping[str, str | None] = field(default_factory=dict)
-    overrides: tuple[str, ...] | None = None
+    overrides: tuple[str, ...] | None = None  # if given, only runs with exactly these
 
 
 @dataclass(frozen=True)
 class Literature:
-    """A row of other people's results.
+    """A row of other people's results."""
 
-    Attributes:
-        label: The method.
-        values: By column.
-        source: Where the numbers come from.
-    """
-
-    label: str
-    values: Values
-    source: str
+    label: str  # the method
+    values: Values  # by column
+    source: str  # where the numbers come from
 
 
 @dataclass(frozen=True)
 class Table:
-    """A table.
+    """A table."""
 
-    Attributes:
-        name: Its key, such as `table_3_2`.
-        title: What it shows.
-        columns: The metrics.
-        rows: The experiments, in the thesis's order.
-        literature: Rows of other people's results.
-        axis: What is varied, where that is a number.
-        notes: Footnotes.
-    """
-
-    name: str
+    name: str  # its key, such as `table_3_2`
     title: str
     columns: tuple[Column, ...]
-    rows: tuple[Row, ...]
+    rows: tuple[Row, ...]  # in the thesis's order
     literature: tuple[Literature, ...] = ()
-    axis: Axis | None = None
+    axis: Axis | None = None  # what is varied, where that is a number
     notes: tuple[str, ...] = ()
 
 

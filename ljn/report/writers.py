@@ -93,30 +93,20 @@ def sources_of(runs: Iterable[Run]) -> list[str]:
 
 
 class Entry(NamedTuple):
-    """A cell of a table as text.
+    """A cell of a table as text."""
 
-    Attributes:
-        text: What it says; never nothing.
-        style: Its class on the page: `thesis`, `ours`, `none` (a dash) or `word`; none of these for another number.
-    """
-
-    text: str
+    text: str  # what it says; never nothing
+    # its class on the page: `thesis`, `ours`, `none` (a dash) or `word`; none of these for another number
     style: str = ""
 
 
 @dataclass(frozen=True)
 class Sheet:
-    """A table's cells as text: what the plain, Markdown, LaTeX and HTML tables have in common.
+    """A table's cells as text: what the plain, Markdown, LaTeX and HTML tables have in common."""
 
-    Attributes:
-        groups: A heading and how many columns it spans, for each of the table's columns.
-        columns: Second headings, one a column.
-        rows: Cells, the row's label first; literature follows our own rows.
-    """
-
-    groups: list[tuple[str, int]]
-    columns: list[str]
-    rows: list[list[Entry]]
+    groups: list[tuple[str, int]]  # a heading and how many columns it spans, for each of the table's columns
+    columns: list[str]  # second headings, one a column
+    rows: list[list[Entry]]  # cells, the row's label first; literature follows our own rows
 
     @property
     def texts(self) -> list[list[str]]:

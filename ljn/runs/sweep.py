@@ -36,27 +36,17 @@ def settings(overrides: Iterable[str], preset: str) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class Run:
-    """A job of a sweep and what its run left.
+    """A job of a sweep and what its run left."""
 
-    Attributes:
-        experiment: Such as `detector/basic`; None in a free grid.
-        overrides: Of its task overrides, `settings`.
-        seed: Its seed.
-        directory: The run's directory; None for a job that never had one.
-        status: `missing`: it is not said to have failed, but has no result.
-        error: What a failed job died of.
-        metrics: Test metrics without `test/`: millimetres, pixels and percent; NaN where a number was not finite.
-        record: `record.json`, or nothing.
-    """
-
-    experiment: str | None
-    overrides: tuple[str, ...]
+    experiment: str | None  # such as `detector/basic`; None in a free grid
+    overrides: tuple[str, ...]  # of its task overrides, `settings`
     seed: int | None
-    directory: Path | None
-    status: Status
-    error: str | None = None
+    directory: Path | None  # the run's directory; None for a job that never had one
+    status: Status  # `missing`: nothing says that it failed, but it has no result
+    error: str | None = None  # what a failed job died of
+    # test metrics without `test/`: millimetres, pixels and percent; NaN where a number was not finite
     metrics: Mapping[str, float] = field(default_factory=dict)
-    record: Mapping[str, Any] = field(default_factory=dict)
+    record: Mapping[str, Any] = field(default_factory=dict)  # `record.json`, or nothing
 
     @property
     def name(self) -> str:
@@ -167,21 +157,15 @@ class Run:
 
 @dataclass(frozen=True)
 class Sweep:
-    """A sweep: `sweep.json` and its runs.
+    """A sweep: `sweep.json` and its runs."""
 
-    Attributes:
-        name: Such as `table_3_2`.
-        preset: The sizes, such as `small`.
-        tables: Names of the tables that it fills.
-        command: What started it.
-        runs: In the order of the jobs; of jobs of the same experiment, settings and seed, the first.
-    """
-
-    name: str
-    preset: str
-    tables: tuple[str, ...]
-    command: str
-    runs: tuple[Run, ...]
+    name: str  # such as `table_3_2`
+    preset: str  # the sizes, such as `small`
+    tables: tuple[str, ...]  # names of the tables that it fills
+    command: str  # what started it
+    runs: tuple[
+        Run, ...
+    ]  # in the order of the jobs; of those of equal experiment, settings and seed, the first
 
 
 def read_sweep(directory: Path) -> Sweep:

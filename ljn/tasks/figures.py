@@ -25,19 +25,12 @@ _LOG = logging.getLogger(__name__)
 
 
 class Column(NamedTuple):
-    """A checkpoint in a figure.
+    """A checkpoint in a figure."""
 
-    Attributes:
-        title: What it is and what noise its initial joints have.
-        module: The trained module.
-        batch: The test samples with the initial joints that it gets.
-        facts: For `figures.json`.
-    """
-
-    title: str
+    title: str  # what it is and what noise its initial joints have
     module: Any
-    batch: Batch
-    facts: dict[str, Any]
+    batch: Batch  # the test samples with the initial joints that it gets
+    facts: dict[str, Any]  # for `figures.json`
 
 
 def figures(cfg: DictConfig) -> dict[str, float]:

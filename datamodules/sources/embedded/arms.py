@@ -14,15 +14,10 @@ from ljn.geometry.rotations import euler_to_rotmat, rotation_about
 
 
 class Goal(NamedTuple):
-    """A normal distribution of wrist positions: left arm, from the shoulder, chest's axes, in arm lengths.
+    """A normal distribution of wrist positions: left arm, from the shoulder, chest's axes, in arm lengths."""
 
-    Attributes:
-        mean: To the left, up, forward.
-        deviation: Standard deviations.
-    """
-
-    mean: tuple[float, float, float]
-    deviation: tuple[float, float, float]
+    mean: tuple[float, float, float]  # to the left, up, forward
+    deviation: tuple[float, float, float]  # standard deviation along each
 
 
 GOALS: dict[str, Goal] = {

@@ -21,15 +21,9 @@ from ljn.geometry.rotations import euler_to_rotmat, rotmat_to_euler, rotvec_to_r
 
 
 class Ranges(NamedTuple):
-    """Limits of three angles, degrees, for the left side or the middle; the right side mirrors them.
+    """Limits of three angles, degrees, for the left side or the middle; the right side mirrors them."""
 
-    Attributes:
-        axes: The axes in the order of the product, see `euler_to_rotmat`.
-        low: Lower ends.
-        high: Upper ends.
-    """
-
-    axes: str
+    axes: str  # the axes in the order of the product, see `euler_to_rotmat`
     low: tuple[float, float, float]
     high: tuple[float, float, float]
 

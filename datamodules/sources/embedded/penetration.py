@@ -14,19 +14,12 @@ from ljn.body.skeleton import JOINT_INDEX
 
 
 class _Part(NamedTuple):
-    """A stretch of the body for one capsule.
+    """A stretch of the body for one capsule."""
 
-    Attributes:
-        joint: The joint that moves it.
-        vertices_of: Joints whose vertices (by their largest blend weight) it covers.
-        towards: The joint that its axis points to, or a coordinate axis of the rest frame.
-        begins_at: Which share of its length, from the end at the joint, is left out.
-    """
-
-    joint: str
-    vertices_of: tuple[str, ...]
-    towards: str
-    begins_at: float = 0.0
+    joint: str  # the joint that moves it
+    vertices_of: tuple[str, ...]  # joints whose vertices (by their largest blend weight) it covers
+    towards: str  # the joint that its axis points to, or a coordinate axis of the rest frame
+    begins_at: float = 0.0  # which share of its length, from the end at the joint, is left out
 
 
 # The trunk is wider than deep: three capsules across, one above the other, fill it. An upper arm begins in the chest;
@@ -62,21 +55,13 @@ _MAY_TOUCH |= {("ribs", f"{side}_upper_arm") for side in SIDES}  # a hanging arm
 
 
 class Capsules(NamedTuple):
-    """Capsules that move with joints.
+    """Capsules that move with joints."""
 
-    Attributes:
-        names: P of them.
-        joints: `(P, 2)` long, the joints that move the two ends of each axis.
-        ends: `(P, 2, 3)`, metres, the ends relative to these joints, rest frame.
-        radii: `(P,)`, metres.
-        pairs: `(2, Q)` long, the pairs of capsules that should not meet.
-    """
-
-    names: tuple[str, ...]
-    joints: Tensor
-    ends: Tensor
-    radii: Tensor
-    pairs: Tensor
+    names: tuple[str, ...]  # `(P,)`
+    joints: Tensor  # `(P, 2)` long, the joints that move the two ends of each axis
+    ends: Tensor  # `(P, 2, 3)`, metres, the ends relative to these joints, rest frame
+    radii: Tensor  # `(P,)`, metres
+    pairs: Tensor  # `(2, Q)` long, the pairs of capsules that should not meet
 
 
 def fit_capsules(body: BodyModel) -> Capsules:

@@ -27,19 +27,12 @@ LEFT_ARM, RIGHT_ARM = (
 
 
 class Donors(NamedTuple):
-    """Poses to take from.
+    """Poses to take from."""
 
-    Attributes:
-        rotmat: `(M, 24, 3, 3)`, headings dropped.
-        name: `(M,)` str, where each comes from.
-        frame: `(M,)` int64, its frame there, -1 where there are no frames.
-        weight: `(M,)`, how often each is taken, summing to 1.
-    """
-
-    rotmat: Tensor
-    name: np.ndarray
-    frame: np.ndarray
-    weight: np.ndarray
+    rotmat: Tensor  # `(M, 24, 3, 3)`, headings dropped
+    name: np.ndarray  # `(M,)` str, where each comes from
+    frame: np.ndarray  # `(M,)` int64, its frame there, -1 where there are no frames
+    weight: np.ndarray  # `(M,)`, how often each is taken, summing to 1
 
     def draw(self, rng: np.random.Generator, n: int) -> np.ndarray:
         """`n` rows by their weights."""
@@ -48,17 +41,11 @@ class Donors(NamedTuple):
 
 
 class Made(NamedTuple):
-    """Poses made from donors.
+    """Poses made from donors."""
 
-    Attributes:
-        rotmat: `(n, 24, 3, 3)`.
-        name: `(n,)` str, the donors' names.
-        frame: `(n,)` int64, frame of the legs' donor.
-    """
-
-    rotmat: Tensor
-    name: np.ndarray
-    frame: np.ndarray
+    rotmat: Tensor  # `(n, 24, 3, 3)`
+    name: np.ndarray  # `(n,)` str, the donors' names
+    frame: np.ndarray  # `(n,)` int64, frame of the legs' donor
 
 
 def clip_donors(rotmat: Tensor, clip: np.ndarray) -> Donors:

@@ -33,19 +33,12 @@ half precision up to 62 mm."""
 
 @dataclass(frozen=True)
 class Source:
-    """What all bodies share.
-
-    Attributes:
-        makehuman: The files' content.
-        topology: The decimated mesh, of indices into `rows`.
-        rows: `(V,)`, the mesh's vertices among all of MakeHuman's.
-        weights: `(V, 24)`, skinning weights.
-    """
+    """What all bodies share."""
 
     makehuman: MakeHuman
-    topology: Topology
-    rows: NDArray[np.int64]
-    weights: Array
+    topology: Topology  # the decimated mesh, of indices into `rows`
+    rows: NDArray[np.int64]  # `(V,)`, the mesh's vertices among all of MakeHuman's
+    weights: Array  # `(V, 24)`, skinning weights
 
 
 def read_source(folder: Path) -> Source:

@@ -68,20 +68,13 @@ def joint_of_bone(bone: str) -> int:
 
 @dataclass(frozen=True)
 class MakeHuman:
-    """The base mesh with everything that deforms it.
+    """The base mesh with everything that deforms it."""
 
-    Attributes:
-        vertices: `(N, 3)`, metres, the base shape with its helper geometry.
-        body_faces: The body's polygons, three or four vertex indices each; closed, genus 0.
-        cubes: `(24, N)`, SMPL's joints as weighted means of helper vertices.
-        weights: `(N, 24)`, skinning weights, merged to SMPL's joints; rows of helpers are zero.
-        targets: Blend shapes by the attribute values they belong to: vertex indices and offsets in metres.
-    """
-
-    vertices: Array
-    body_faces: list[list[int]]
-    cubes: Array
-    weights: Array
+    vertices: Array  # `(N, 3)`, metres, the base shape with its helper geometry
+    body_faces: list[list[int]]  # the body's polygons, three or four vertex indices each; closed, genus 0
+    cubes: Array  # `(24, N)`, SMPL's joints as weighted means of helper vertices
+    weights: Array  # `(N, 24)`, skinning weights, merged to SMPL's joints; rows of helpers are zero
+    # blend shapes by the attribute values they belong to: vertex indices and offsets in metres
     targets: dict[tuple[str, ...], tuple[Index, Array]]
 
     @classmethod
