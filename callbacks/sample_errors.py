@@ -19,9 +19,6 @@ class SampleErrors(Callback):
     under the metric's key, and what the module says is stored beside them (`truth` and `stored` of `StageModule`): of
     both stages, `joints`, `pred_joints` and `initial_joints` `(S, 24, 3)` in metres, camera frame; of a mesh regressor
     also `pred_pose` `(S, 72)` and `pred_betas` `(S, 10)`.
-
-    Args:
-        directory: Where the file goes.
     """
 
     def __init__(self, directory: str | Path) -> None:

@@ -26,9 +26,6 @@ class SweepReport(Callback):
     After every job, so that neither a failure nor a kill costs what is there: `sweep.json`, which names the runs, and
     the tables as files. At the end also `report.html`, and the tables are printed. Each job leaves a note in Hydra's
     sweep directory, since jobs may run in processes of their own.
-
-    Args:
-        output_dir: `paths.output_dir`.
     """
 
     def __init__(self, output_dir: str | Path) -> None:

@@ -43,13 +43,7 @@ class EpochSampler(Sampler[tuple[int, int]]):
 
 
 class SharedBatches(Sampler[list[Any]]):
-    """One process's equal part of every batch, so that several processes take the steps that one would take.
-
-    Args:
-        batches: The whole batches.
-        process: This process's number.
-        num_processes: How many there are.
-    """
+    """One process's equal part of every batch, so that several processes take the steps that one would take."""
 
     def __init__(self, batches: BatchSampler, process: int = 0, num_processes: int = 1) -> None:
         self.batches = batches
@@ -73,12 +67,6 @@ def fixed_batches(size: int, batch_size: int, process: int = 0, num_processes: i
     """A process's batches of the indices of a fixed set: each index in one process only, and in one batch.
 
     All processes have the same number of batches and none is empty, since each may wait for the others in each.
-
-    Args:
-        size: Samples in the set, at least `num_processes`.
-        batch_size: Samples in the processes' batches together.
-        process: This process's number.
-        num_processes: How many there are.
     """
     if num_processes == 1:
         return [list(range(start, min(start + batch_size, size))) for start in range(0, size, batch_size)]

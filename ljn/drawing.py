@@ -43,15 +43,7 @@ class Sample(NamedTuple):
 
 
 def draw_samples(samples: list[Sample], num_columns: int) -> "Figure":
-    """A page of samples, each from the front (the camera's view) and from the side.
-
-    Args:
-        samples: What to draw, in reading order.
-        num_columns: Samples in a row.
-
-    Returns:
-        A matplotlib figure, made without a display.
-    """
+    """A page of samples, each from the front (the camera's view) and from the side."""
     num_rows = -(-len(samples) // num_columns)
     figure = new_figure(3.8 * num_columns, 2.3 * num_rows + 0.3)
     axes = figure.subplots(num_rows, 2 * num_columns, squeeze=False)
@@ -130,16 +122,7 @@ class MeshSample(NamedTuple):
 
 
 def draw_meshes(samples: list[MeshSample], faces: np.ndarray, num_columns: int) -> "Figure":
-    """A page of samples (Fig. 3.13): predicted (red) beside true (blue) mesh, front and side, the cloud over them.
-
-    Args:
-        samples: What to draw, in reading order.
-        faces: `(F, 3)`, vertex indices.
-        num_columns: Samples in a row.
-
-    Returns:
-        A matplotlib figure.
-    """
+    """A page of samples (Fig. 3.13): predicted (red) beside true (blue) mesh, front and side, the cloud over them."""
     num_rows = -(-len(samples) // num_columns)
     figure = new_figure(6.0 * num_columns, 2.3 * num_rows)
     axes = figure.subplots(num_rows, 4 * num_columns, squeeze=False)

@@ -57,11 +57,7 @@ class SMPL(nn.Module):
     _places: Tensor
 
     def __init__(self, models: BodyModel | Sequence[BodyModel]) -> None:
-        """Builds the layer.
-
-        Args:
-            models: One body, or bodies of different genders that share their faces.
-        """
+        """Builds the layer."""
         super().__init__()
         models = [models] if isinstance(models, BodyModel) else list(models)
         self.genders = tuple(model.gender for model in models)
@@ -86,12 +82,7 @@ class SMPL(nn.Module):
 
     @classmethod
     def load(cls, path: str | Path | None = None, gender: str = "neutral") -> "SMPL":
-        """The layer of one model file; see `load_body_model`.
-
-        Args:
-            path: A `.npz` or `.pkl` in SMPL's format; None takes the embedded body.
-            gender: A key of `GENDERS`.
-        """
+        """The layer of one model file; see `load_body_model`."""
         return cls(load_body_model(path, gender))
 
     def forward(self, pose: Tensor, betas: Tensor, gender: Tensor | None = None) -> SMPLOutput:
@@ -129,15 +120,7 @@ class SMPL(nn.Module):
         return SMPLOutput(vertices, joints)
 
     def rest_joints(self, betas: Tensor, gender: Tensor | None = None) -> Tensor:
-        """The joints J(beta) of the unposed body.
-
-        Args:
-            betas: `(..., 10)`.
-            gender: `(...)` long, codes of `GENDERS`; may be left out where one body is loaded.
-
-        Returns:
-            `(..., 24, 3)`, metres, SMPL's rest frame.
-        """
+        """The joints J(beta) of the unposed body."""
         _check_shape("betas", betas, betas.shape[:-1], NUM_BETAS)
         (joints,) = self._by_gender(lambda slot, flat: (self._rest_joints(slot, flat),), gender, betas)
         return joints
@@ -145,12 +128,6 @@ class SMPL(nn.Module):
     @torch.no_grad()
     def fit_betas(self, vertices: Tensor) -> Tensor:
         """The shape whose rest mesh comes nearest to a mesh, by least squares; where one body is loaded.
-
-        Args:
-            vertices: `(..., V, 3)`, metres, in rest pose (T-pose, SMPL's rest frame).
-
-        Returns:
-            `(..., 10)`.
 
         Raises:
             ValueError: Several bodies are loaded, or the mesh has another number of vertices.

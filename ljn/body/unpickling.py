@@ -29,10 +29,6 @@ class ForbiddenContentError(Exception):
 def read_pickled_arrays(data: bytes, keys: Sequence[str]) -> dict[str, NDArray[Any]]:
     """The arrays of a pickled dict, those of `keys` that it holds.
 
-    Args:
-        data: The pickle. Arrays may be numpy's, chumpy's or scipy's sparse matrices, which become dense.
-        keys: Which entries to decode.
-
     Raises:
         ForbiddenContentError: It names something else than arrays and containers, or is not a dict of arrays.
         Exception: Whatever numpy and pickle raise at a damaged file.

@@ -89,15 +89,7 @@ def rot6d_to_rotmat(rot6d: Tensor) -> Tensor:
 
 
 def rotation_about(axis: str, angle: Tensor) -> Tensor:
-    """Rotation matrices about a coordinate axis.
-
-    Args:
-        axis: "x", "y" or "z".
-        angle: `(...)`, radians, counter-clockwise seen from the axis' tip.
-
-    Returns:
-        `(..., 3, 3)`.
-    """
+    """Rotation matrices about a coordinate axis."""
     if axis not in ("x", "y", "z"):
         raise ValueError(f"axis: expected 'x', 'y' or 'z', got {axis!r}")
     unit = torch.eye(3, dtype=angle.dtype, device=angle.device)["xyz".index(axis)]
@@ -174,16 +166,7 @@ def swing_twist(rotmat: Tensor, axis: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def interpolate_rotmat(start: Tensor, end: Tensor, share: Tensor) -> Tensor:
-    """Rotations on the shortest way from `start` to `end` (spherical linear interpolation).
-
-    Args:
-        start: `(..., 3, 3)` rotation matrices.
-        end: `(..., 3, 3)` rotation matrices.
-        share: `(...)`, how far to go: 0 stays at `start`, 1 reaches `end`.
-
-    Returns:
-        `(..., 3, 3)`.
-    """
+    """Rotations on the shortest way from `start` to `end` (spherical linear interpolation)."""
     return start @ rotvec_to_rotmat(share[..., None] * rotmat_to_rotvec(start.mT @ end))
 
 
@@ -202,14 +185,7 @@ def smpl_pose_to_body_world(pose: Tensor) -> Tensor:
 
 
 def body_world_pose_to_smpl(pose: Tensor) -> Tensor:
-    """A body-world pose turned into SMPL's own axes: the inverse of `smpl_pose_to_body_world`.
-
-    Args:
-        pose: `(..., 72)`, axis-angle, radians, mapping SMPL's rest frame into body world.
-
-    Returns:
-        `(..., 72)`, mapping SMPL's rest frame into SMPL's axes (y up, z forward).
-    """
+    """A body-world pose turned into SMPL's own axes: the inverse of `smpl_pose_to_body_world`."""
     return _turn_root(BODY_TO_OPENGL, pose)
 
 

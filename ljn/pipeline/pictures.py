@@ -22,16 +22,7 @@ _BESIDE = Camera(fx=400, fy=400, cx=512, cy=512, width=1024, height=1024)
 
 
 def draw_prediction(prediction: Prediction, depth: np.ndarray, camera: Camera) -> "Figure":
-    """Keypoints on the depth image, the skeleton in the cloud, and the mesh, from the front and from the side.
-
-    Args:
-        prediction: Of one image.
-        depth: `(H, W)`, metres, 0 is background.
-        camera: The camera of this image.
-
-    Returns:
-        A matplotlib figure, made without a display.
-    """
+    """Keypoints on the depth image, the skeleton in the cloud, and the mesh, from the front and from the side."""
     has_mesh = prediction.vertices is not None
     figure = new_figure(15 if has_mesh else 9, 5)
     axes = figure.subplots(1, 5 if has_mesh else 3)

@@ -27,14 +27,7 @@ class Series:
 
 
 def line_chart(series: Sequence[Series], title: str, x_label: str, y_label: str) -> str:
-    """A chart with a legend, as an HTML `figure`.
-
-    Args:
-        series: The lines; those without a finite point are left out, and without any the chart is empty text.
-        title: Its caption.
-        x_label: With the unit.
-        y_label: With the unit.
-    """
+    """A chart with a legend, as an HTML `figure`."""
     shown = []
     for line in series:
         finite = (point for point in line.points if math.isfinite(point[0]) and math.isfinite(point[1]))

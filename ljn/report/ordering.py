@@ -110,10 +110,6 @@ def count_claims(cells: Sequence[Cell]) -> int:
 def verdict(comparisons: Sequence[Comparison], num_claims: int) -> tuple[bool | None, str]:
     """Whether the thesis's ordering holds, in words too.
 
-    Args:
-        comparisons: Of one or more columns; see `compare`.
-        num_claims: Of these columns; see `count_claims`.
-
     Returns:
         None, not True, where nothing speaks against it but rows are without a result.
     """

@@ -15,11 +15,7 @@ _POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
 
 
 def to_html(results: Results) -> str:
-    """The page.
-
-    Args:
-        results: A sweep's tables.
-    """
+    """The page."""
     runs = results.sweep.runs
     parts = [
         *(_table_section(results, table) for table in results.tables),

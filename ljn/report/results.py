@@ -83,9 +83,6 @@ class Results:
 def read_results(directory: Path) -> Results:
     """The tables of a sweep.
 
-    Args:
-        directory: Holds `sweep.json`.
-
     Raises:
         FileNotFoundError: It does not.
         ValueError: That file is damaged, or names a table that there is not.
@@ -104,13 +101,7 @@ def read_results(directory: Path) -> Results:
 
 
 def grids(name: str, title: str, runs: Sequence[Run]) -> list[Table]:
-    """Tables of any runs: a row for each setting, a table for each stage, whose metrics are its own.
-
-    Args:
-        name: The table's name.
-        title: Its title.
-        runs: What is shown.
-    """
+    """Tables of any runs: a row for each setting, a table for each stage, whose metrics are its own."""
     settings: dict[Any, list[Run]] = {}
     for run in runs:
         settings.setdefault((run.experiment, run.overrides), []).append(run)

@@ -33,15 +33,7 @@ _DTYPES = (
 
 
 class Provenance(Callback):
-    """Adds to every checkpoint what is needed to use it alone.
-
-    Args:
-        config: The resolved configuration, plain values.
-        body_hash: Hashes of the bodies of data and model, joined by "-"; empty without bodies.
-        data_licence: What is to be said of the data's licence.
-        run: Name of the run's directory.
-        recipe: How the observations that it was trained on were made; None where there were none.
-    """
+    """Adds to every checkpoint what is needed to use it alone."""
 
     def __init__(
         self,
@@ -120,10 +112,6 @@ class Checkpoint:
 
 def read_checkpoint(path: str | Path, name: str = "ckpt_path") -> Checkpoint:
     """Read a checkpoint.
-
-    Args:
-        path: The file.
-        name: The argument to name in errors.
 
     Raises:
         FileNotFoundError: There is no such file.
@@ -287,11 +275,6 @@ def _check_shapes(expected: Mapping[str, Tensor], got: Mapping[str, Tensor]) -> 
 def load_state(module: torch.nn.Module, checkpoint: Checkpoint, argument: str = "ckpt_path") -> None:
     """Load a checkpoint's weights into the module that its configuration describes.
 
-    Args:
-        module: The module.
-        checkpoint: The checkpoint.
-        argument: The argument to name in errors.
-
     Raises:
         ValueError: The weights belong to another model.
     """
@@ -304,11 +287,6 @@ def load_state(module: torch.nn.Module, checkpoint: Checkpoint, argument: str = 
 
 def load_module(path: str | Path, kind: type[StageModule], name: str = "ckpt_path") -> tuple[Any, Checkpoint]:
     """The trained module of a checkpoint, in evaluation mode, and the checkpoint.
-
-    Args:
-        path: The file.
-        kind: What the module must be: `JointDetector` or `MeshRegressor`.
-        name: The argument to name in errors.
 
     Raises:
         FileNotFoundError: There is no such file.

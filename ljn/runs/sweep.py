@@ -20,12 +20,7 @@ Status = Literal["complete", "failed", "missing"]
 
 
 def settings(overrides: Iterable[str], preset: str) -> tuple[str, ...]:
-    """Those of a job's typed overrides that say what its run is, sorted.
-
-    Args:
-        overrides: As they were typed.
-        preset: The sweep's preset, which says nothing new.
-    """
+    """Those of a job's typed overrides that say what its run is, sorted."""
     kept = []
     for override in overrides:
         key = key_of(override)
@@ -114,11 +109,7 @@ class Run:
         return rows
 
     def curve(self, metric: str) -> dict[int, float]:
-        """The validation metric by epoch, counted from 1, over all attempts of the run.
-
-        Args:
-            metric: Without `val/`.
-        """
+        """The validation metric by epoch, counted from 1, over all attempts of the run."""
         trained: set[int] = set()
         values: dict[int, float] = {}
         for row in self._csv_rows:
@@ -134,9 +125,6 @@ class Run:
 
     def sample_values(self, metric: str) -> tuple[np.ndarray, np.ndarray] | None:
         """A metric's values of its test samples.
-
-        Args:
-            metric: Its key.
 
         Returns:
             The samples `(S, T)`, each its number and what is true of it, by which samples of two runs can be told to be
@@ -170,9 +158,6 @@ class Sweep:
 
 def read_sweep(directory: Path) -> Sweep:
     """A sweep and its runs.
-
-    Args:
-        directory: Holds `sweep.json`.
 
     Raises:
         FileNotFoundError: It does not.

@@ -30,11 +30,6 @@ def with_checkpoint_config(cfg: DictConfig, checkpoint: Checkpoint, overrides: l
 
     Of the checkpoint's groups, the keys that `ljn.runs.keys` gives to the machine or the call have this call's values.
 
-    Args:
-        cfg: The call's composed configuration.
-        checkpoint: The checkpoint.
-        overrides: The call's overrides, as they were typed.
-
     Raises:
         ValueError: An override is about something that the checkpoint decides.
     """
@@ -59,10 +54,6 @@ def _with_call(stored: Any, call: Any, key: str) -> Any:
 
 def apply_overrides(cfg: DictConfig, overrides: list[str]) -> None:
     """Change single values of data, trainer and body in a resolved configuration.
-
-    Args:
-        cfg: What a checkpoint's configuration is part of.
-        overrides: As they would be typed; those about what the checkpoint has no say in are left out.
 
     Raises:
         ValueError: An override is about something that the checkpoint decides, or names no value.

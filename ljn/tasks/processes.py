@@ -26,11 +26,7 @@ def is_job_of_sweep() -> bool:
 
 
 def sweep_name(hydra: Any) -> str:
-    """What a multirun is called: a grid of the user's own has no name but the time of its start.
-
-    Args:
-        hydra: Hydra's own part of the configuration.
-    """
+    """What a multirun is called: a grid of the user's own has no name but the time of its start."""
     return hydra.runtime.choices.get("sweep") or f"grid-{Path(hydra.sweep.dir).name}"
 
 
@@ -76,9 +72,6 @@ def own_devices(trainer: Mapping[str, Any]) -> dict[str, list[int]]:
     """For a job of a sweep on a machine with several GPUs: `devices`, one that no other job uses; else nothing.
 
     Jobs that run side by side would all take the first one.
-
-    Args:
-        trainer: The trainer's configuration.
     """
     import torch
 
@@ -95,10 +88,6 @@ def claim_gpu(count: int, directory: Path | None = None) -> int:
     """The index of a GPU that no other process of this machine has claimed, for as long as this process lives.
 
     Where all are taken, one is shared.
-
-    Args:
-        count: How many GPUs this process sees.
-        directory: Where the claims are kept, as locked files.
     """
     import fcntl
 

@@ -18,9 +18,6 @@ def report(cfg: DictConfig) -> dict[str, float]:
         cfg: The composed configuration; `task.directory` is the sweep's directory, which holds `sweep.json`: null for
             the last one that changed below `output_dir/sweeps`.
 
-    Returns:
-        Nothing: the numbers are in the tables.
-
     Raises:
         FileNotFoundError: There is no such sweep.
     """

@@ -59,9 +59,6 @@ def summaries(config: Mapping[str, Any]) -> dict[str, str]:
     """What of a metric's values a run's summary keeps: `min` or `max`, the best one, or `last`.
 
     A test's metrics are logged once, and are left out.
-
-    Args:
-        config: Resolved configuration, plain values, whose module says what it logs.
     """
     module: Any = get_class(config["module"]["_target_"])
     kept = {None: "last", False: "min", True: "max"}

@@ -46,14 +46,7 @@ _MAX_FLEXION_DEG, _MIN_FLEXION_DEG = 148.0, 4.0
 
 
 def draw_targets(rng: np.random.Generator, goals: np.ndarray, swing: np.ndarray, drop: np.ndarray) -> Tensor:
-    """Wrist positions, to the side, up and forward of the shoulder: `(n, 2, 3)`, arm lengths, left arm first.
-
-    Args:
-        rng: Source of the draws.
-        goals: `(n, 2)`, indices into `GOALS`.
-        swing: `(n,)`, how far the left arm swings forward and the right one back, arm lengths.
-        drop: `(n,)`, degrees, how far all is turned downwards in the end.
-    """
+    """Wrist positions, to the side, up and forward of the shoulder: `(n, 2, 3)`, arm lengths, left arm first."""
     mean = np.array([goal.mean for goal in GOALS.values()])[goals]
     deviation = np.array([goal.deviation for goal in GOALS.values()])[goals]
     target = mean + deviation * rng.standard_normal(mean.shape)

@@ -109,14 +109,7 @@ _GROUPS = _grouped()
 
 
 def within_limits(rotmat: Tensor) -> Tensor:
-    """Poses held within the ranges of motion; joints that are within them stay as they are, to the last bit.
-
-    Args:
-        rotmat: `(n, 24, 3, 3)`.
-
-    Returns:
-        `(n, 24, 3, 3)`.
-    """
+    """Poses held within the ranges of motion; joints that are within them stay as they are, to the last bit."""
     result = rotmat.clone()
     for axes, joints, low, high in _GROUPS:
         angles = rotmat_to_euler(axes, rotmat[:, joints])
@@ -168,12 +161,6 @@ def with_square_elbows(rotmat: Tensor) -> Tensor:
     Motion capture leaves open how far an upper arm is turned about itself, and files differ in where they put an
     elbow's axis. The sideways part of a bent elbow is handed on to the shoulder as twist: forearm and hand keep their
     places and directions. Below 5 degrees of flexion an elbow's plane says nothing; above 20 all is handed on.
-
-    Args:
-        rotmat: `(n, 24, 3, 3)`.
-
-    Returns:
-        `(n, 24, 3, 3)`.
     """
     result = rotmat.clone()
     for side, sign in SIDES.items():

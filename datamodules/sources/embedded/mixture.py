@@ -61,14 +61,7 @@ class MixtureSettings:
 
 
 class PoseMixture:
-    """Draws poses of a mixture.
-
-    Args:
-        settings: What it is made of.
-        donors: Frames of clips.
-        body: The body whose arms reach for their targets and that poses are kept clear on, beside the reference
-            skeleton.
-    """
+    """Draws poses of a mixture."""
 
     def __init__(self, settings: MixtureSettings, donors: Donors, body: BodyModel) -> None:
         self.settings = settings

@@ -9,12 +9,7 @@ from datamodules.sources.embedded.arms import GOALS
 
 
 class Draw:
-    """Random numbers for a family's `n` poses.
-
-    Args:
-        rng: Source of the draws.
-        n: Number of poses.
-    """
+    """Random numbers for a family's `n` poses."""
 
     def __init__(self, rng: np.random.Generator, n: int) -> None:
         self.rng = rng

@@ -19,16 +19,7 @@ _REST_SPREAD_DEG = 4.0
 
 
 def draw_poses(rng: np.random.Generator, families: np.ndarray, offsets: Tensor) -> Tensor:
-    """Poses of the families.
-
-    Args:
-        rng: Source of the draws.
-        families: `(n,)` str, keys of `FAMILIES`.
-        offsets: `(24, 3)`, metres, of the skeleton whose arms reach for their targets; see `joint_offsets`.
-
-    Returns:
-        `(n, 24, 3, 3)`, not yet held within joint limits.
-    """
+    """Poses of the families."""
     n = len(families)
     angles = np.zeros((n, NUM_JOINTS, 3))
     goals = np.zeros((n, 2), np.int64)

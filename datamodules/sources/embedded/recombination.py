@@ -139,13 +139,6 @@ for _side in SIDES:
 
 
 def jittered(rotmat: Tensor, jitter_deg: float, rng: np.random.Generator) -> Tensor:
-    """Poses `(n, 24, 3, 3)` with every joint but the root turned a little.
-
-    Args:
-        rotmat: `(n, 24, 3, 3)`.
-        jitter_deg: Standard deviation about each axis, degrees; half of that and less about the axes that a knee or an
-            elbow does not bend about.
-        rng: Source of the draws.
-    """
+    """Poses `(n, 24, 3, 3)` with every joint but the root turned a little."""
     turn = np.deg2rad(jitter_deg) * _JITTER * rng.standard_normal((len(rotmat), NUM_JOINTS, 3))
     return rotmat @ rotvec_to_rotmat(torch.from_numpy(turn))

@@ -62,13 +62,7 @@ def draw_body(
 
 
 def draw_page(models: list[BodyModel], path: Path, seed: int = 2) -> None:
-    """Writes a page of pictures: each body's T-pose, random and extreme shapes; poses and parts of one.
-
-    Args:
-        models: The bodies; the neutral one, or else the first, shows poses and parts.
-        path: The PNG file.
-        seed: Of the random shapes.
-    """
+    """Writes a page of pictures: each body's T-pose, random and extreme shapes; poses and parts of one."""
     rows: list[tuple[str, Image]] = []
     rng = np.random.default_rng(seed)
     standing = pose_vector(ARMS_DOWN)

@@ -61,12 +61,7 @@ def fit_regressor(bodies: Array, joints: Array, weights: Array, mirror: Index, c
 
 
 def mean_of_points(points: Array, targets: Array) -> Array:
-    """The weights `(N,)`, at least 0 and summing to 1, whose mean of points is nearest to the targets.
-
-    Args:
-        points: `(n, N, 3)`, n samples of N points, metres.
-        targets: `(n, 3)`, metres.
-    """
+    """The weights `(N,)`, at least 0 and summing to 1, whose mean of points is nearest to the targets."""
     scale = np.sqrt(len(points))
     matrix = np.concatenate(
         [
