@@ -67,6 +67,7 @@ def fixed_batches(size: int, batch_size: int, process: int = 0, num_processes: i
     """A process's batches of the indices of a fixed set: each index in one process only, and in one batch.
 
     All processes have the same number of batches and none is empty, since each may wait for the others in each.
+    `batch_size` counts the samples of the processes' batches together.
     """
     if num_processes == 1:
         return [list(range(start, min(start + batch_size, size))) for start in range(0, size, batch_size)]

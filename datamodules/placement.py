@@ -87,15 +87,3 @@ def place(
         for axis, (low, high, from_low, to_high) in enumerate(borders)
     ]
     return np.array([*shift, depth])
-
-
-def floor_height(vertices: np.ndarray) -> np.ndarray:
-    """Height of the floor that touches each mesh from below: its lowest vertex.
-
-    Args:
-        vertices: `(..., V, 3)`, metres, body world (z up).
-
-    Returns:
-        `(...)`, metres.
-    """
-    return vertices[..., 2].min(-1)

@@ -43,7 +43,7 @@ class Sample(NamedTuple):
 
 
 def draw_samples(samples: list[Sample], num_columns: int) -> "Figure":
-    """A page of samples, each from the front (the camera's view) and from the side."""
+    """A page of samples in reading order, each from the front (the camera's view) and from the side."""
     num_rows = -(-len(samples) // num_columns)
     figure = new_figure(3.8 * num_columns, 2.3 * num_rows + 0.3)
     axes = figure.subplots(num_rows, 2 * num_columns, squeeze=False)
@@ -122,7 +122,10 @@ class MeshSample(NamedTuple):
 
 
 def draw_meshes(samples: list[MeshSample], faces: np.ndarray, num_columns: int) -> "Figure":
-    """A page of samples (Fig. 3.13): predicted (red) beside true (blue) mesh, front and side, the cloud over them."""
+    """A page of samples (Fig. 3.13): predicted (red) beside true (blue) mesh, front and side, the cloud over them.
+
+    All meshes have the faces `(F, 3)`.
+    """
     num_rows = -(-len(samples) // num_columns)
     figure = new_figure(6.0 * num_columns, 2.3 * num_rows)
     axes = figure.subplots(num_rows, 4 * num_columns, squeeze=False)

@@ -57,7 +57,7 @@ class SMPL(nn.Module):
     _places: Tensor
 
     def __init__(self, models: BodyModel | Sequence[BodyModel]) -> None:
-        """Builds the layer."""
+        """Builds the layer of one body, or of bodies of different genders that share their faces."""
         super().__init__()
         models = [models] if isinstance(models, BodyModel) else list(models)
         self.genders = tuple(model.gender for model in models)
@@ -82,7 +82,7 @@ class SMPL(nn.Module):
 
     @classmethod
     def load(cls, path: str | Path | None = None, gender: str = "neutral") -> "SMPL":
-        """The layer of one model file; see `load_body_model`."""
+        """The layer of one model file, or of an embedded body; see `load_body_model`."""
         return cls(load_body_model(path, gender))
 
     def forward(self, pose: Tensor, betas: Tensor, gender: Tensor | None = None) -> SMPLOutput:
@@ -120,14 +120,16 @@ class SMPL(nn.Module):
         return SMPLOutput(vertices, joints)
 
     def rest_joints(self, betas: Tensor, gender: Tensor | None = None) -> Tensor:
-        """The joints J(beta) of the unposed body."""
+        """The joints J(beta) of the unposed body, `(..., 24, 3)`, metres, SMPL's rest frame; see `forward`."""
         _check_shape("betas", betas, betas.shape[:-1], NUM_BETAS)
         (joints,) = self._by_gender(lambda slot, flat: (self._rest_joints(slot, flat),), gender, betas)
         return joints
 
     @torch.no_grad()
     def fit_betas(self, vertices: Tensor) -> Tensor:
-        """The shape whose rest mesh comes nearest to a mesh, by least squares; where one body is loaded.
+        """The shape `(..., 10)` whose rest mesh comes nearest to a mesh, by least squares; where one body is loaded.
+
+        `vertices` are `(..., V, 3)`, metres, in rest pose (T-pose, SMPL's rest frame).
 
         Raises:
             ValueError: Several bodies are loaded, or the mesh has another number of vertices.

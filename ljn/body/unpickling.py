@@ -27,7 +27,7 @@ class ForbiddenContentError(Exception):
 
 
 def read_pickled_arrays(data: bytes, keys: Sequence[str]) -> dict[str, NDArray[Any]]:
-    """The arrays of a pickled dict, those of `keys` that it holds.
+    """The arrays of a pickled dict, those of `keys` that it holds; scipy's sparse matrices become dense.
 
     Raises:
         ForbiddenContentError: It names something else than arrays and containers, or is not a dict of arrays.

@@ -89,7 +89,10 @@ def rot6d_to_rotmat(rot6d: Tensor) -> Tensor:
 
 
 def rotation_about(axis: str, angle: Tensor) -> Tensor:
-    """Rotation matrices about a coordinate axis."""
+    """Rotation matrices `(..., 3, 3)` about the "x", "y" or "z" axis.
+
+    `angle` is `(...)`, radians, counter-clockwise seen from the axis' tip.
+    """
     if axis not in ("x", "y", "z"):
         raise ValueError(f"axis: expected 'x', 'y' or 'z', got {axis!r}")
     unit = torch.eye(3, dtype=angle.dtype, device=angle.device)["xyz".index(axis)]
@@ -166,7 +169,7 @@ def swing_twist(rotmat: Tensor, axis: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def interpolate_rotmat(start: Tensor, end: Tensor, share: Tensor) -> Tensor:
-    """Rotations on the shortest way from `start` to `end` (spherical linear interpolation)."""
+    """Rotations `(..., 3, 3)`, a share `(...)` of the shortest way from `start` to `end` (spherical interpolation)."""
     return start @ rotvec_to_rotmat(share[..., None] * rotmat_to_rotvec(start.mT @ end))
 
 
@@ -181,18 +184,9 @@ def smpl_pose_to_body_world(pose: Tensor) -> Tensor:
     Returns:
         `(..., 72)`, mapping SMPL's rest frame into body world.
     """
-    return _turn_root(BODY_TO_OPENGL.T, pose)
-
-
-def body_world_pose_to_smpl(pose: Tensor) -> Tensor:
-    """A body-world pose turned into SMPL's own axes: the inverse of `smpl_pose_to_body_world`."""
-    return _turn_root(BODY_TO_OPENGL, pose)
-
-
-def _turn_root(rotmat: Tensor, pose: Tensor) -> Tensor:
     _check_shape("pose", pose, (72,))
     root, others = pose.split([3, 69], dim=-1)
-    return torch.cat([rotmat_to_rotvec(rotmat.to(pose) @ rotvec_to_rotmat(root)), others], dim=-1)
+    return torch.cat([rotmat_to_rotvec(BODY_TO_OPENGL.T.to(pose) @ rotvec_to_rotmat(root)), others], dim=-1)
 
 
 def _check_axes(axes: str) -> None:

@@ -22,7 +22,10 @@ _BESIDE = Camera(fx=400, fy=400, cx=512, cy=512, width=1024, height=1024)
 
 
 def draw_prediction(prediction: Prediction, depth: np.ndarray, camera: Camera) -> "Figure":
-    """Keypoints on the depth image, the skeleton in the cloud, and the mesh, from the front and from the side."""
+    """A page of one image's prediction: keypoints on the depth, skeleton in the cloud, mesh; front and side.
+
+    `depth` is `(H, W)`, metres, 0 is background.
+    """
     has_mesh = prediction.vertices is not None
     figure = new_figure(15 if has_mesh else 9, 5)
     axes = figure.subplots(1, 5 if has_mesh else 3)

@@ -19,7 +19,9 @@ def write_arrays(path: Path, prediction: Prediction, camera: Camera) -> None:
 
 
 def write_mesh(path: Path, vertices: np.ndarray, faces: np.ndarray) -> None:
-    """Write a mesh as `.ply`, in the camera frame as the cloud, or as `.glb`, in glTF's axes: y up, z to the camera.
+    """Write a mesh as `.ply`, in the camera frame, or as `.glb`, in glTF's axes: y up, z to the camera.
+
+    `vertices` are `(V, 3)`, metres, camera frame; `faces` `(F, 3)`, vertex indices.
 
     Raises:
         ImportError: trimesh is missing.

@@ -27,7 +27,7 @@ class Series:
 
 
 def line_chart(series: Sequence[Series], title: str, x_label: str, y_label: str) -> str:
-    """A chart with a legend, as an HTML `figure`."""
+    """A chart with a legend, as an HTML `figure`; without a finite point, nothing."""
     shown = []
     for line in series:
         finite = (point for point in line.points if math.isfinite(point[0]) and math.isfinite(point[1]))

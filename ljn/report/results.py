@@ -81,11 +81,11 @@ class Results:
 
 
 def read_results(directory: Path) -> Results:
-    """The tables of a sweep.
+    """The tables of a sweep, from the directory that holds its `sweep.json`.
 
     Raises:
-        FileNotFoundError: It does not.
-        ValueError: That file is damaged, or names a table that there is not.
+        FileNotFoundError: There is no such file.
+        ValueError: It is damaged, or names a table that there is not.
     """
     sweep = read_sweep(directory)
     unknown = [name for name in sweep.tables if name not in TABLES]

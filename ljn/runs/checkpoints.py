@@ -33,7 +33,7 @@ _DTYPES = (
 
 
 class Provenance(Callback):
-    """Adds to every checkpoint what is needed to use it alone."""
+    """Adds to every checkpoint what is needed to use it alone; see `Checkpoint`."""
 
     def __init__(
         self,
@@ -111,7 +111,7 @@ class Checkpoint:
 
 
 def read_checkpoint(path: str | Path, name: str = "ckpt_path") -> Checkpoint:
-    """Read a checkpoint.
+    """Read a checkpoint; errors call its argument `name`.
 
     Raises:
         FileNotFoundError: There is no such file.
@@ -273,7 +273,7 @@ def _check_shapes(expected: Mapping[str, Tensor], got: Mapping[str, Tensor]) -> 
 
 
 def load_state(module: torch.nn.Module, checkpoint: Checkpoint, argument: str = "ckpt_path") -> None:
-    """Load a checkpoint's weights into the module that its configuration describes.
+    """Load a checkpoint's weights into the module that its configuration describes; errors name `argument`.
 
     Raises:
         ValueError: The weights belong to another model.
@@ -286,7 +286,7 @@ def load_state(module: torch.nn.Module, checkpoint: Checkpoint, argument: str = 
 
 
 def load_module(path: str | Path, kind: type[StageModule], name: str = "ckpt_path") -> tuple[Any, Checkpoint]:
-    """The trained module of a checkpoint, in evaluation mode, and the checkpoint.
+    """The trained module of a checkpoint, of the class `kind`, in evaluation mode; and the checkpoint.
 
     Raises:
         FileNotFoundError: There is no such file.

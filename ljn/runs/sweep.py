@@ -20,7 +20,7 @@ Status = Literal["complete", "failed", "missing"]
 
 
 def settings(overrides: Iterable[str], preset: str) -> tuple[str, ...]:
-    """Those of a job's typed overrides that say what its run is, sorted."""
+    """Those of a job's typed overrides that say what its run is, sorted; all jobs share the preset."""
     kept = []
     for override in overrides:
         key = key_of(override)
@@ -109,7 +109,7 @@ class Run:
         return rows
 
     def curve(self, metric: str) -> dict[int, float]:
-        """The validation metric by epoch, counted from 1, over all attempts of the run."""
+        """A validation metric (without `val/`) by epoch, counted from 1, over all attempts of the run."""
         trained: set[int] = set()
         values: dict[int, float] = {}
         for row in self._csv_rows:
@@ -157,7 +157,7 @@ class Sweep:
 
 
 def read_sweep(directory: Path) -> Sweep:
-    """A sweep and its runs.
+    """A sweep and its runs, from the directory that holds its `sweep.json`.
 
     Raises:
         FileNotFoundError: It does not.

@@ -55,6 +55,8 @@ def _with_call(stored: Any, call: Any, key: str) -> Any:
 def apply_overrides(cfg: DictConfig, overrides: list[str]) -> None:
     """Change single values of data, trainer and body in a resolved configuration.
 
+    Overrides that the checkpoint has no say in are left out.
+
     Raises:
         ValueError: An override is about something that the checkpoint decides, or names no value.
     """

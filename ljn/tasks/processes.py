@@ -26,7 +26,7 @@ def is_job_of_sweep() -> bool:
 
 
 def sweep_name(hydra: Any) -> str:
-    """What a multirun is called: a grid of the user's own has no name but the time of its start."""
+    """What a multirun is called, by Hydra's part of its configuration; a free grid by the time of its start."""
     return hydra.runtime.choices.get("sweep") or f"grid-{Path(hydra.sweep.dir).name}"
 
 
@@ -71,7 +71,7 @@ def check_processes(plain: Mapping[str, Any]) -> None:
 def own_devices(trainer: Mapping[str, Any]) -> dict[str, list[int]]:
     """For a job of a sweep on a machine with several GPUs: `devices`, one that no other job uses; else nothing.
 
-    Jobs that run side by side would all take the first one.
+    Jobs that run in parallel would all take the first one.
     """
     import torch
 
@@ -85,9 +85,9 @@ _claimed: dict[int, IO[str]] = {}
 
 
 def claim_gpu(count: int, directory: Path | None = None) -> int:
-    """The index of a GPU that no other process of this machine has claimed, for as long as this process lives.
+    """The index of one of `count` visible GPUs that no other process has claimed; where all are taken, of any.
 
-    Where all are taken, one is shared.
+    A claim is a locked file in `directory` and ends with this process.
     """
     import fcntl
 

@@ -56,10 +56,7 @@ def tracking(
 
 
 def summaries(config: Mapping[str, Any]) -> dict[str, str]:
-    """What of a metric's values a run's summary keeps: `min` or `max`, the best one, or `last`.
-
-    A test's metrics are logged once, and are left out.
-    """
+    """What of a metric's values a run's summary keeps (`min`, `max` or `last`), but for a test's, logged once."""
     module: Any = get_class(config["module"]["_target_"])
     kept = {None: "last", False: "min", True: "max"}
     metrics = module.metrics(prefix="val/").items()

@@ -46,7 +46,11 @@ _MAX_FLEXION_DEG, _MIN_FLEXION_DEG = 148.0, 4.0
 
 
 def draw_targets(rng: np.random.Generator, goals: np.ndarray, swing: np.ndarray, drop: np.ndarray) -> Tensor:
-    """Wrist positions, to the side, up and forward of the shoulder: `(n, 2, 3)`, arm lengths, left arm first."""
+    """Wrist positions, to the side, up and forward of the shoulder: `(n, 2, 3)`, arm lengths, left arm first.
+
+    Drawn about `goals` `(n, 2)`, indices into `GOALS`; the left arm swings forward and the right one back by `swing`
+    `(n,)`, arm lengths; then all is turned downwards by `drop` `(n,)`, degrees.
+    """
     mean = np.array([goal.mean for goal in GOALS.values()])[goals]
     deviation = np.array([goal.deviation for goal in GOALS.values()])[goals]
     target = mean + deviation * rng.standard_normal(mean.shape)

@@ -109,7 +109,7 @@ _GROUPS = _grouped()
 
 
 def within_limits(rotmat: Tensor) -> Tensor:
-    """Poses held within the ranges of motion; joints that are within them stay as they are, to the last bit."""
+    """Poses `(n, 24, 3, 3)` held within the ranges of motion; joints within them stay, to the last bit."""
     result = rotmat.clone()
     for axes, joints, low, high in _GROUPS:
         angles = rotmat_to_euler(axes, rotmat[:, joints])
@@ -156,7 +156,7 @@ def _outside_cap(direction: Tensor, pole: Tensor, limit_deg: float) -> tuple[Ten
 
 
 def with_square_elbows(rotmat: Tensor) -> Tensor:
-    """Poses whose elbows bend about their hinge, every joint where it was.
+    """Poses `(n, 24, 3, 3)` whose elbows bend about their hinge, every joint where it was.
 
     Motion capture leaves open how far an upper arm is turned about itself, and files differ in where they put an
     elbow's axis. The sideways part of a bent elbow is handed on to the shoulder as twist: forearm and hand keep their

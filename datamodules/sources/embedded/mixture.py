@@ -61,7 +61,7 @@ class MixtureSettings:
 
 
 class PoseMixture:
-    """Draws poses of a mixture."""
+    """Draws poses of a mixture of frames of clips and families, clear on a body and the reference skeleton."""
 
     def __init__(self, settings: MixtureSettings, donors: Donors, body: BodyModel) -> None:
         self.settings = settings

@@ -19,7 +19,7 @@ _REST_SPREAD_DEG = 4.0
 
 
 def draw_poses(rng: np.random.Generator, families: np.ndarray, offsets: Tensor) -> Tensor:
-    """Poses of the families."""
+    """Poses `(n, 24, 3, 3)` of the families named `(n,)`, on a skeleton (`joint_offsets`), before joint limits."""
     n = len(families)
     angles = np.zeros((n, NUM_JOINTS, 3))
     goals = np.zeros((n, 2), np.int64)

@@ -139,6 +139,9 @@ for _side in SIDES:
 
 
 def jittered(rotmat: Tensor, jitter_deg: float, rng: np.random.Generator) -> Tensor:
-    """Poses `(n, 24, 3, 3)` with every joint but the root turned a little."""
+    """Poses `(n, 24, 3, 3)` with every joint but the root turned by a standard deviation about each axis, degrees.
+
+    By half of that and less about the axes that a knee or an elbow does not bend about.
+    """
     turn = np.deg2rad(jitter_deg) * _JITTER * rng.standard_normal((len(rotmat), NUM_JOINTS, 3))
     return rotmat @ rotvec_to_rotmat(torch.from_numpy(turn))

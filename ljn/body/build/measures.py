@@ -139,7 +139,7 @@ def pose_measures(model: BodyModel, vertices: Array) -> dict[str, float]:
 
 
 def report(model: BodyModel, num_draws: int = 200, seed: int = 1) -> str:
-    """The measurements of a body, as lines of text."""
+    """The measurements of a body and of random shapes of it, beta ~ N(0, 1), as lines of text."""
     betas = np.random.default_rng(seed).normal(size=(num_draws, NUM_BETAS))
     bodies = shaped(model, betas)
     mean_stature, mean_bmi = stature_and_bmi(model.v_template.astype(np.float64), model.faces)

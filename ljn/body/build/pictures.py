@@ -62,7 +62,7 @@ def draw_body(
 
 
 def draw_page(models: list[BodyModel], path: Path, seed: int = 2) -> None:
-    """Writes a page of pictures: each body's T-pose, random and extreme shapes; poses and parts of one."""
+    """Writes a page of pictures: each body's T-pose, random and extreme shapes; poses and parts of the neutral one."""
     rows: list[tuple[str, Image]] = []
     rng = np.random.default_rng(seed)
     standing = pose_vector(ARMS_DOWN)

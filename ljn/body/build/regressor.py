@@ -61,7 +61,7 @@ def fit_regressor(bodies: Array, joints: Array, weights: Array, mirror: Index, c
 
 
 def mean_of_points(points: Array, targets: Array) -> Array:
-    """The weights `(N,)`, at least 0 and summing to 1, whose mean of points is nearest to the targets."""
+    """The weights `(N,)`, at least 0 and summing to 1, whose mean of points `(n, N, 3)` is nearest to targets."""
     scale = np.sqrt(len(points))
     matrix = np.concatenate(
         [
