@@ -26,18 +26,12 @@ class SampleErrors(Callback):
         self._batches: list[dict[str, Tensor]] = []
 
     def on_test_batch_end(  # type: ignore[override]
-        self,
-        trainer: Trainer,
-        pl_module: StageModule,
-        outputs: Any,
-        batch: Any,
-        batch_idx: int,
-        dataloader_idx: int = 0,
+        self, trainer: Trainer, pl_module: StageModule, outputs: Any, batch: Any, *_: int
     ) -> None:
         """Keep what is stored of a batch."""
         names = ("sample_id", *pl_module.truth, *pl_module.stored, *pl_module.metrics.table)
-        kept = {name: outputs[name] if name in outputs else batch[name] for name in names}
-        self._batches.append({name: value.detach().cpu() for name, value in kept.items()})
+        values = {name: outputs[name] if name in outputs else batch[name] for name in names}
+        self._batches.append({name: value.detach().cpu() for name, value in values.items()})
 
     def on_test_end(self, trainer: Trainer, pl_module: StageModule) -> None:  # type: ignore[override]
         """Write the file."""

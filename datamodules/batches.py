@@ -13,7 +13,7 @@ from torch.utils.data import BatchSampler, Sampler
 class EpochSampler(Sampler[tuple[int, int]]):
     """Indices in an order drawn anew for each epoch, each with the epoch's number beside it.
 
-    The number travels with the index, so that workers that live on through epochs draw anew without being told.
+    The number travels with the index, so that workers that live on through epochs draw anew, too.
 
     Args:
         num_samples: Samples in an epoch.
@@ -71,9 +71,9 @@ def fixed_batches(size: int, batch_size: int, process: int = 0, num_processes: i
     """
     if num_processes == 1:
         return [list(range(start, min(start + batch_size, size))) for start in range(0, size, batch_size)]
-    own = np.array_split(np.arange(size), num_processes)[process]
+    indices = np.array_split(np.arange(size), num_processes)[process]
     number = min(-(-size // batch_size), size // num_processes)
-    return [part.tolist() for part in np.array_split(own, number)]
+    return [part.tolist() for part in np.array_split(indices, number)]
 
 
 class ByValue(dict[str, Tensor]):

@@ -1,4 +1,4 @@
-"""Reading files from outside: bounded in size, depth and time, and what is said of those that cannot be read."""
+"""Reading files from outside: bounded in size, depth and time; and the words for why one cannot be read."""
 
 import io
 import json
@@ -97,16 +97,9 @@ def _text(path: Path, max_bytes: int) -> str:
 
 
 def read_arrays(path: Path, keys: Collection[str] | None = None) -> dict[str, np.ndarray]:
-    """The arrays of an `.npz` file, or the one of an `.npy` file under the key "".
+    """The arrays of an `.npz` file, or those of `keys` that it has; the one of an `.npy` file under the key "".
 
-    An archive may unpack to 256 MiB, or to 32 times its own size where that is more.
-
-    Args:
-        path: The file.
-        keys: Which arrays of an `.npz` to read, of those that there are; None reads all.
-
-    Raises:
-        Exception: One of `READ_ERRORS`.
+    An archive may unpack to 256 MiB, or to 32 times its size where that is more. Raises `READ_ERRORS`.
     """
     with path.open("rb") as file:
         if file.read(2) != b"PK":
@@ -129,14 +122,11 @@ def _check_entries(entries: Collection[zipfile.ZipInfo], max_bytes: int) -> None
 
 def _array(content: bytes) -> np.ndarray:
     """The array of an `.npy` file's content, of the size that its header says."""
-    stream = io.BytesIO(content)
-    version = np.lib.format.read_magic(stream)
-    if version == (1, 0):
-        shape, is_fortran, dtype = np.lib.format.read_array_header_1_0(stream)
-    elif version == (2, 0):
-        shape, is_fortran, dtype = np.lib.format.read_array_header_2_0(stream)
-    else:
+    stream, form = io.BytesIO(content), np.lib.format
+    if (version := form.read_magic(stream)) not in ((1, 0), (2, 0)):
         raise ValueError(f"an .npy file of version {version}")
+    read_header = form.read_array_header_1_0 if version == (1, 0) else form.read_array_header_2_0
+    shape, is_fortran, dtype = read_header(stream)
     if dtype.kind not in "biufcSU" or dtype.itemsize == 0 or min(shape, default=0) < 0:
         raise ValueError(f"it holds {brief(str(dtype))} of shape {shown(shape)}, expected numbers or text")
     start = stream.tell()
@@ -152,9 +142,8 @@ def check_archive(content: bytes) -> None:
 
     PyTorch itself passes over the checksums.
     """
-    if not content.startswith(
-        b"PK\x03\x04"
-    ):  # PyTorch would take any other beginning for a form without checksums
+    # PyTorch would take any other beginning for a form without checksums.
+    if not content.startswith(b"PK\x03\x04"):
         raise ValueError("not the archive that PyTorch writes")
     with zipfile.ZipFile(io.BytesIO(content)) as archive:
         entries = archive.infolist()
@@ -225,9 +214,7 @@ def plain_values(content: Any) -> Iterator[Any]:
             if depth >= _MAX_DEPTH or size + _SIZE_OF_VALUE * (len(pending) + len(entries)) > _MAX_SIZE:
                 raise ValueError("nested too deeply, or of too many values")
             pending += [(entry, depth + 1) for entry in entries]
-        elif (
-            value is None or type(value) in (str, bool, float) or (type(value) is int and abs(value) < 2**63)
-        ):
+        elif type(value) in (type(None), str, bool, float) or (type(value) is int and abs(value) < 2**63):
             yield value
         else:
             raise ValueError(f"a value of type {type(value).__name__}, or out of range")

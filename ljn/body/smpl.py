@@ -36,9 +36,9 @@ class SMPL(nn.Module):
     """Body meshes M(beta, theta) of Eq. 3.1-3.2, differentiable, for one body or several genders at once.
 
     It computes in the precision of its buffers (`.double()` for float64), under autocast too, since half
-    precision would move vertices by millimetres (as TF32 would: leave torch's float32 matmul precision at
-    "highest"). The bodies are no part of its state dict: they may be
-    licensed, and must not travel in a checkpoint. `hash` says which they were.
+    precision would move vertices by millimetres (as TF32 would: leave torch's float32 matmul precision at "highest").
+    The bodies are no part of its state dict: they may be licensed, and must not travel in a checkpoint. `hash` says
+    which they were.
 
     Attributes:
         faces: `(F, 3)` long, vertex indices.
@@ -103,16 +103,7 @@ class SMPL(nn.Module):
             return self.from_rotmats(rotvec_to_rotmat(rotvecs), betas, gender)
 
     def from_rotmats(self, rotmats: Tensor, betas: Tensor, gender: Tensor | None = None) -> SMPLOutput:
-        """Posed vertices and joints, from rotation matrices.
-
-        Args:
-            rotmats: `(..., 24, 3, 3)`, relative to the parent joint, as the vectors of `forward`'s `pose`.
-            betas: `(..., 10)`, see `forward`.
-            gender: `(...)`, see `forward`.
-
-        Returns:
-            Vertices `(..., V, 3)` and joints `(..., 24, 3)`, metres.
-        """
+        """Posed vertices and joints, from rotation matrices `(..., 24, 3, 3)` relative to the parent; see `forward`."""
         if rotmats.shape[-3:] != (NUM_JOINTS, 3, 3):
             raise ValueError(f"rotmats: expected shape (..., {NUM_JOINTS}, 3, 3), got {tuple(rotmats.shape)}")
         _check_shape("betas", betas, rotmats.shape[:-3], NUM_BETAS)

@@ -120,9 +120,8 @@ def euler_to_rotmat(axes: str, angles: Tensor) -> Tensor:
         (j, i): ca * sc + sa * sb * cc, (j, j): ca * cc - sa * sb * sc, (j, k): -sa * cb,
         (k, i): sa * sc - ca * sb * cc, (k, j): sa * cc + ca * sb * sc, (k, k): ca * cb,
     }  # fmt: skip
-    return torch.stack([entries[row, column] for row in range(3) for column in range(3)], -1).unflatten(
-        -1, (3, 3)
-    )
+    ordered = [entries[row, column] for row in range(3) for column in range(3)]
+    return torch.stack(ordered, -1).unflatten(-1, (3, 3))
 
 
 def rotmat_to_euler(axes: str, rotmat: Tensor) -> Tensor:

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ljn.body.skeleton import ROOT
-from ljn.drawing import FROM_THE_SIDE, bone_lines, new_figure
+from ljn.drawing import FROM_THE_SIDE, add_legend, bone_lines, new_figure
 from ljn.geometry.camera import Camera
 from ljn.pipeline.pipeline import Prediction
 from ljn.render.shading import shade_mesh
@@ -35,17 +35,12 @@ def draw_prediction(prediction: Prediction, depth: np.ndarray, camera: Camera) -
         axis.set_title(f"cloud and joints, {view}", fontsize=9, loc="left")
     if has_mesh:
         _draw_meshes(axes[3], axes[4], prediction, depth, camera)
-    figure.legend(
-        handles=[
-            axes[1].plot([], [], color=_INITIAL, lw=2, label="lifted keypoints")[0],
-            axes[1].plot([], [], color=_PREDICTED, lw=2, label="predicted joints")[0],
-            axes[1].plot([], [], color=_FILLED, lw=0, marker="o", ms=4, label="filled-in keypoints")[0],
-        ],
-        loc="outside lower center",
-        ncols=3,
-        fontsize=9,
-        frameon=False,
-    )
+    handles = [
+        axes[1].plot([], [], color=_INITIAL, lw=2, label="lifted keypoints")[0],
+        axes[1].plot([], [], color=_PREDICTED, lw=2, label="predicted joints")[0],
+        axes[1].plot([], [], color=_FILLED, lw=0, marker="o", ms=4, label="filled-in keypoints")[0],
+    ]
+    add_legend(figure, handles)
     return figure
 
 
@@ -95,10 +90,8 @@ def _draw_meshes(
     is_mesh = np.isfinite(colours[..., 0])
     body = depth[depth > 0]
     grey = np.where(depth > 0, 0.9 - 0.5 * (depth - body.min()) / max(float(np.ptp(body)), 1e-6), 1.0)
-    image = np.where(
-        is_mesh[..., None], _MESH_OPACITY * colours + (1 - _MESH_OPACITY) * grey[..., None], grey[..., None]
-    )
-    front.imshow(image)
+    over_grey = _MESH_OPACITY * colours + (1 - _MESH_OPACITY) * grey[..., None]
+    front.imshow(np.where(is_mesh[..., None], over_grey, grey[..., None]))
     _crop(front, is_mesh | (depth > 0), prediction.keypoints)
     front.set_title("mesh over the depth image", fontsize=9, loc="left")
 

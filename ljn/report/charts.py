@@ -31,8 +31,7 @@ def line_chart(series: Sequence[Series], title: str, x_label: str, y_label: str)
     shown = []
     for line in series:
         finite = (point for point in line.points if math.isfinite(point[0]) and math.isfinite(point[1]))
-        points = sorted(finite, key=lambda point: point[0])
-        if points:
+        if points := sorted(finite, key=lambda point: point[0]):
             shown.append((line, points))
     if not shown:
         return ""

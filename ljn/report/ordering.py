@@ -67,14 +67,10 @@ class Comparison:
 
 
 def compare(columns: Sequence[Sequence[Cell]]) -> tuple[Comparison, ...]:
-    """The comparisons of a table.
+    """The comparisons of a table, from its columns' cells; columns without a goal are not compared.
 
-    Args:
-        columns: Its columns' cells; columns without a goal are not compared.
-
-    Returns:
-        Where the thesis has numbers, all pairs of rows that it puts in an order and that have results; where it has
-        none for any row of the table, our best row and each other one.
+    Where the thesis has numbers, all pairs of rows that it puts in an order and that have results; where it has none
+    for any row of the table, our best row and each other one.
     """
     is_claim = any(cell.thesis is not None for cells in columns for cell in cells)
     comparisons: list[Comparison] = []
@@ -86,18 +82,11 @@ def compare(columns: Sequence[Sequence[Cell]]) -> tuple[Comparison, ...]:
         for better, worse, is_adjacent in _claims(cells, sign) if is_claim else _best_and_others(cells, sign):
             if better.mean is None or worse.mean is None:
                 continue
-            comparisons.append(
-                Comparison(
-                    column=better.column,
-                    better=better.label,
-                    worse=worse.label,
-                    is_claim=is_claim,
-                    is_adjacent=is_adjacent,
-                    lead=sign * (worse.mean - better.mean),
-                    spread=None if better.sd is None or worse.sd is None else math.hypot(better.sd, worse.sd),
-                    interval=None if has_main else _interval(better, worse, sign),
-                )
-            )
+            lead = sign * (worse.mean - better.mean)
+            spread = None if better.sd is None or worse.sd is None else math.hypot(better.sd, worse.sd)
+            interval = None if has_main else _interval(better, worse, sign)
+            names = (better.column, better.label, worse.label)
+            comparisons.append(Comparison(*names, is_claim, is_adjacent, lead, spread, interval))
         has_main = True
     return tuple(comparisons)
 
@@ -108,10 +97,9 @@ def count_claims(cells: Sequence[Cell]) -> int:
 
 
 def verdict(comparisons: Sequence[Comparison], num_claims: int) -> tuple[bool | None, str]:
-    """Whether the thesis's ordering holds, in words too.
+    """Whether the thesis's ordering holds in one or more columns, in words too.
 
-    Returns:
-        None, not True, where nothing speaks against it but rows are without a result.
+    None, not True, where nothing speaks against it but rows are without a result.
     """
     claims = [comparison for comparison in comparisons if comparison.is_claim]
     if not claims:
@@ -128,16 +116,9 @@ def verdict(comparisons: Sequence[Comparison], num_claims: int) -> tuple[bool | 
 def paired_bootstrap(
     better: np.ndarray, worse: np.ndarray, num_resamples: int = NUM_RESAMPLES, seed: int = _SEED
 ) -> tuple[float, float]:
-    """The 95 % interval of the mean of `worse - better` over test samples.
+    """The 95 % interval (ends, in the metric's unit) of the mean of `worse - better` over test samples.
 
-    Args:
-        better: `(S,)`, a metric of which less is better.
-        worse: `(S,)`, of the same samples.
-        num_resamples: How often the samples are drawn anew, with replacement.
-        seed: Of the drawing.
-
-    Returns:
-        Its 2.5th and 97.5th percentile, in the metric's unit.
+    Both are `(S,)`, of the same samples, which are drawn anew `num_resamples` times, with replacement.
     """
     differences = np.asarray(worse, np.float64) - np.asarray(better, np.float64)
     generator = np.random.default_rng(seed)

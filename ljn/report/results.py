@@ -59,10 +59,8 @@ class TableResult:
     @property
     def has_thesis(self) -> tuple[bool, ...]:
         """Of each column, whether any row has a number of the thesis."""
-        return tuple(
-            any(row.cells[number].thesis is not None for row in self.rows)
-            for number in range(len(self.table.columns))
-        )
+        columns = range(len(self.table.columns))
+        return tuple(any(row.cells[number].thesis is not None for row in self.rows) for number in columns)
 
 
 @dataclass(frozen=True)
@@ -75,9 +73,7 @@ class Results:
     @property
     def lost(self) -> tuple[Run, ...]:
         """The runs that failed, then those that left no result although nothing says that they failed."""
-        return tuple(
-            run for status in ("failed", "missing") for run in self.sweep.runs if run.status == status
-        )
+        return tuple(run for kind in ("failed", "missing") for run in self.sweep.runs if run.status == kind)
 
 
 def read_results(directory: Path) -> Results:
@@ -188,18 +184,10 @@ def _result(row: Row, label: str, runs: Sequence[Run], table: Table) -> RowResul
     for column in table.columns:
         metric = row.metrics.get(column.metric, column.metric)
         values = [run.metrics[metric] for run in runs if metric is not None and metric in run.metrics]
-        cells.append(
-            Cell(
-                column=column,
-                label=label,
-                runs=tuple(runs),
-                metric=metric,
-                mean=math.fsum(values) / len(values) if values else None,
-                sd=statistics.stdev(values) if len(values) > 1 and all(map(math.isfinite, values)) else None,
-                num_seeds=len(values),
-                thesis=row.thesis.get(column.metric),
-            )
-        )
+        mean = math.fsum(values) / len(values) if values else None
+        sd = statistics.stdev(values) if len(values) > 1 and all(map(math.isfinite, values)) else None
+        thesis = row.thesis.get(column.metric)
+        cells.append(Cell(column, label, tuple(runs), metric, mean, sd, len(values), thesis))
     x = row.x
     if table.axis is not None and row.x is not None:
         configured = (run.setting(table.axis.key) for run in runs)

@@ -87,11 +87,7 @@ ROOT_ALIGNED_NOTE = (
     "† Joints that only mean something beside the root, such as the simple baseline's: MPJPE and PCKh after the roots "
     "were moved to the same place (test/mpjpe_root_aligned, test/pckh_root_aligned)."
 )
-ROOT_ALIGNED = {
-    "mpjpe": "mpjpe_root_aligned",
-    "mpjpe_eq38": "mpjpe_root_aligned",
-    "pckh": "pckh_root_aligned",
-}
+ROOT_ALIGNED = dict.fromkeys(("mpjpe", "mpjpe_eq38"), "mpjpe_root_aligned") | {"pckh": "pckh_root_aligned"}
 """What rows of detectors show whose joints only mean something beside the root."""
 _NO_PCKH = {"mpjpe": "initial_mpjpe", "pckh": None}
 
@@ -110,6 +106,10 @@ def _values(columns: Sequence[Column], *values: float | None) -> dict[str, float
     return {column.metric: value for column, value in zip(columns, values)}
 
 
+def _simple_baseline(label: str, experiment: str, mpjpe: float, pckh: float) -> Row:
+    return Row(label, experiment, _values(_DETECTOR, mpjpe, pckh), metrics=ROOT_ALIGNED)
+
+
 _DETECTOR_PROPOSED = _values(_DETECTOR_NOISE, 53.2, 12.5, 24.2, 90.8)
 _MESH_PROPOSED = _values(_MESH_NOISE, 105.6, 25.1, 34.5, 33.0)
 _MESH_CHAIN = _values(_MESH_NOISE, None, None, 38.8, 36.8)
@@ -125,18 +125,8 @@ _ALL = (
             Row("basic", "detector/basic", _values(_DETECTOR, 32.1, 85.6)),
             Row("proposed without EDM", "detector/no_edm", _values(_DETECTOR, 25.0, 90.2)),
             Row("proposed", "detector/proposed", _values(_DETECTOR, 24.2, 90.8)),
-            Row(
-                "simple baseline, σ = 0",
-                "detector/simple_baseline_0px",
-                _values(_DETECTOR, 59.4, 51.9),
-                metrics=ROOT_ALIGNED,
-            ),
-            Row(
-                "simple baseline, σ = 10 px",
-                "detector/simple_baseline",
-                _values(_DETECTOR, 81.3, 33.6),
-                metrics=ROOT_ALIGNED,
-            ),
+            _simple_baseline("simple baseline, σ = 0", "detector/simple_baseline_0px", 59.4, 51.9),
+            _simple_baseline("simple baseline, σ = 10 px", "detector/simple_baseline", 81.3, 33.6),
         ),
         notes=(
             "All but the fourth row have 2D joints with noise of σ = 10 px.",

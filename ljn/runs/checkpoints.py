@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from lightning.pytorch import Callback, LightningModule, Trainer
+from lightning.pytorch import Callback
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 from torch import Tensor
 from torch.nn.modules.module import register_module_parameter_registration_hook
@@ -37,7 +37,7 @@ class Provenance(Callback):
 
     def __init__(
         self,
-        config: Mapping[str, Any],
+        config: dict[str, Any],
         body_hash: str,
         data_licence: str,
         run: str,
@@ -45,16 +45,14 @@ class Provenance(Callback):
     ) -> None:
         self.content = {
             "version": CHECKPOINT_VERSION,
-            "config": dict(config),
+            "config": config,
             "body_hash": body_hash,
             "data_licence": data_licence,
             "run": run,
             "observation": None if recipe is None else asdict(recipe),
         }
 
-    def on_save_checkpoint(
-        self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]
-    ) -> None:
+    def on_save_checkpoint(self, trainer: Any, pl_module: Any, checkpoint: dict[str, Any]) -> None:
         """Add the content under its key."""
         checkpoint[_PROVENANCE_KEY] = self.content
 
@@ -138,28 +136,23 @@ def read_checkpoint(path: str | Path, name: str = "ckpt_path") -> Checkpoint:
             "carries no whole configuration"
         )
     if provenance["version"] != CHECKPOINT_VERSION:
-        newer = provenance["version"] > CHECKPOINT_VERSION
+        age, fix = "an older", "train it again, or evaluate it with the version it is from"
+        if provenance["version"] > CHECKPOINT_VERSION:
+            age, fix = "a newer", "update the library"
         raise ValueError(
-            f"{name}: '{path}' was written by {'a newer' if newer else 'an older'} version of this library "
-            f"(checkpoint version {provenance['version']}, this one reads {CHECKPOINT_VERSION}); "
-            + (
-                "update the library"
-                if newer
-                else "train it again, or evaluate it with the version it is from"
-            )
+            f"{name}: '{path}' was written by {age} version of this library (checkpoint version "
+            f"{provenance['version']}, this one reads {CHECKPOINT_VERSION}); {fix}"
         )
-    checkpoint = Checkpoint(
-        path=path,
-        config=provenance["config"],
-        body_hash=provenance["body_hash"],
-        data_licence=provenance["data_licence"],
-        run=provenance["run"],
-        epoch=content["epoch"] + 1,
-        recipe=_recipe(provenance.get("observation"), path, name),
-        state=dict(content["state_dict"]),
-        file_hash=hashlib.sha256(data).hexdigest()[:16],
-    )
+    recipe = provenance.get("observation")
     try:
+        checkpoint = Checkpoint(
+            path=path,
+            **{key: provenance[key] for key in ("config", "body_hash", "data_licence", "run")},
+            epoch=content["epoch"] + 1,
+            recipe=None if recipe is None else ObservationRecipe(**recipe),
+            state=dict(content["state_dict"]),
+            file_hash=hashlib.sha256(data).hexdigest()[:16],
+        )
         _check_state(checkpoint.state, len(data))
         _check_content(checkpoint)
     except _CONTENT_ERRORS as error:
@@ -167,17 +160,6 @@ def read_checkpoint(path: str | Path, name: str = "ckpt_path") -> Checkpoint:
             f"{name}: '{path}': {reason(error, 1000)}; use another checkpoint of the run"
         ) from error
     return checkpoint
-
-
-def _recipe(content: Any, path: Path, name: str) -> ObservationRecipe | None:
-    if content is None:
-        return None
-    try:
-        return ObservationRecipe(**content)
-    except _CONTENT_ERRORS as error:
-        raise ValueError(
-            f"{name}: '{path}' holds no recipe of observations that is known here ({reason(error)})"
-        ) from error
 
 
 def _is_ours(content: Any, provenance: Any) -> bool:
@@ -200,11 +182,10 @@ def _is_ours(content: Any, provenance: Any) -> bool:
 def _is_resolved(config: Any) -> bool:
     """Whether a configuration is plain values: an interpolation would be resolved here, on this machine's values."""
     try:
-        return not any(
-            isinstance(value, str) and ("${" in value or value == "???") for value in plain_values(config)
-        )
+        texts = [value for value in plain_values(config) if isinstance(value, str)]
     except ValueError:
         return False
+    return not any("${" in text or text == "???" for text in texts)
 
 
 def _check_state(state: Mapping[Any, Any], file_size: int) -> None:
@@ -261,10 +242,7 @@ def _check_shapes(expected: Mapping[str, Tensor], got: Mapping[str, Tensor]) -> 
     shapes, got_shapes = (
         {name: tuple(value.shape) for name, value in state.items()} for state in (expected, got)
     )
-    if shapes != got_shapes:
-        differing = sorted(
-            name for name in shapes.keys() | got_shapes.keys() if shapes.get(name) != got_shapes.get(name)
-        )
+    if differing := sorted({name for name, _ in shapes.items() ^ got_shapes.items()}):
         name = differing[0]
         raise ValueError(
             f"holds the weights of another model: {len(differing)} tensors differ, the first is '{brief(name)}', "

@@ -9,9 +9,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import yaml
 
-from ljn.reading import READ_ERRORS
+from ljn.reading import READ_ERRORS, read_arrays, read_yaml
 from ljn.runs import layout
 from ljn.runs.files import read_json, read_metrics
 from ljn.runs.keys import key_of, kind_of
@@ -21,12 +20,10 @@ Status = Literal["complete", "failed", "missing"]
 
 def settings(overrides: Iterable[str], preset: str) -> tuple[str, ...]:
     """Those of a job's typed overrides that say what its run is, sorted; all jobs share the preset."""
-    kept = []
-    for override in overrides:
-        key = key_of(override)
-        if kind_of(key).is_setting and (key, override.partition("=")[2]) != ("preset", preset):
-            kept.append(override)
-    return tuple(sorted(kept))
+    is_preset = {line for line in overrides if (key_of(line), line.partition("=")[2]) == ("preset", preset)}
+    return tuple(
+        sorted(line for line in overrides if kind_of(key_of(line)).is_setting and line not in is_preset)
+    )
 
 
 @dataclass(frozen=True)
@@ -38,7 +35,7 @@ class Run:
     seed: int | None
     directory: Path | None  # the run's directory; None for a job that never had one
     status: Status  # `missing`: nothing says that it failed, but it has no result
-    error: str | None = None  # what a failed job died of
+    error: str | None = None  # of a failed job
     # test metrics without `test/`: millimetres, pixels and percent; NaN where a number was not finite
     metrics: Mapping[str, float] = field(default_factory=dict)
     record: Mapping[str, Any] = field(default_factory=dict)  # `record.json`, or nothing
@@ -86,8 +83,8 @@ class Run:
         if self.directory is None:
             return {}
         try:
-            return mapping(yaml.safe_load((self.directory / layout.CONFIG).read_text()))
-        except (*READ_ERRORS, yaml.YAMLError):
+            return mapping(read_yaml(self.directory / layout.CONFIG))
+        except READ_ERRORS:
             return {}
 
     def setting(self, key: str) -> float | None:
@@ -124,20 +121,18 @@ class Run:
         return {epoch + 1: values[epoch] for epoch in sorted(values) if epoch in trained}
 
     def sample_values(self, metric: str) -> tuple[np.ndarray, np.ndarray] | None:
-        """A metric's values of its test samples.
+        """Its test samples `(S, T)`, each by its number and its truth, and a metric's values of them `(S,)`.
 
-        Returns:
-            The samples `(S, T)`, each its number and what is true of it, by which samples of two runs can be told to be
-            the same, and their values `(S,)`; None where they are not known.
+        None where they are not known.
         """
         truth = _list(self.record.get("truth"))
         if self.directory is None or not truth:
             return None
         try:
-            with np.load(self.directory / layout.SAMPLES) as arrays:
-                ids, values = arrays["sample_id"], arrays[metric].astype(np.float64)
-                parts = [arrays[name].reshape(len(ids), -1) for name in truth]
-                samples = np.column_stack([ids, *parts]).astype(np.float64)
+            arrays = read_arrays(self.directory / layout.SAMPLES, ("sample_id", metric, *truth))
+            ids, values = arrays["sample_id"], arrays[metric].astype(np.float64)
+            parts = [arrays[name].reshape(len(ids), -1) for name in truth]
+            samples = np.column_stack([ids, *parts]).astype(np.float64)
         except READ_ERRORS:
             return None
         return (samples, values) if values.shape == (len(samples),) else None
@@ -171,20 +166,16 @@ def read_sweep(directory: Path) -> Sweep:
     content = read_json(path)
     if content is None or not isinstance(content.get("jobs"), list):
         raise ValueError(
-            f"'{path}': expected a JSON object with a list of jobs, got a damaged file; run the sweep again"
+            f"'{path}': expected an object with a list of jobs, got a damaged file; run the sweep again"
         )
     preset = str(content.get("preset") or "missing")
     runs: dict[Any, Run] = {}
     for job in read_jobs(directory):
         run = _read_run(job, directory, preset)
         runs.setdefault((run.experiment, run.overrides, run.seed), run)
-    return Sweep(
-        name=str(content.get("name") or directory.name),
-        preset=preset,
-        tables=tuple(map(str, _list(content.get("tables")))),
-        command=str(content.get("command") or "missing"),
-        runs=tuple(runs.values()),
-    )
+    name, command = content.get("name") or directory.name, content.get("command") or "missing"
+    tables = tuple(map(str, _list(content.get("tables"))))
+    return Sweep(str(name), preset, tables, str(command), tuple(runs.values()))
 
 
 def read_jobs(directory: Path) -> list[dict[str, Any]]:
@@ -195,40 +186,25 @@ def read_jobs(directory: Path) -> list[dict[str, Any]]:
 def job_of(content: Any) -> dict[str, Any]:
     """A job as `sweep.json` has it, read: what is of another type than it should be is None, or no override."""
     job = mapping(content)
-    texts = {
-        key: job[key] if isinstance(job.get(key), str) else None
-        for key in ("experiment", "run_dir", "status", "error")
-    }
-    seed = job.get("seed")
-    overrides = [str(override) for override in _list(job.get("overrides"))]
-    return texts | {"overrides": overrides, "seed": seed if isinstance(seed, int) else None}
+    types = {"experiment": str, "run_dir": str, "status": str, "error": str, "seed": int}
+    typed = {key: job[key] if isinstance(job.get(key), kind) else None for key, kind in types.items()}
+    return typed | {"overrides": [str(override) for override in _list(job.get("overrides"))]}
 
 
 def _read_run(job: Mapping[str, Any], sweep: Path, preset: str) -> Run:
     directory = _locate(job["run_dir"], sweep)
     record = (read_json(directory / layout.RECORD) if directory else None) or {}
-    prefix = "test/"
-    metrics = {
-        key.removeprefix(prefix): value
-        for key, value in ((read_metrics(directory) if directory else None) or {}).items()
-        if key.startswith(prefix)
-    }
+    everything = (read_metrics(directory) if directory else None) or {}
+    metrics = {key[5:]: value for key, value in everything.items() if key.startswith("test/")}
     error = job["error"] or record.get("error")
     status: Status = "complete"
     if job["status"] == "failed" or (not metrics and record.get("status") == "failed"):
         status, metrics = "failed", {}
     elif not metrics:
         status = "missing"
-    return Run(
-        experiment=job["experiment"],
-        overrides=settings(job["overrides"], preset),
-        seed=job["seed"],
-        directory=directory,
-        status=status,
-        error=None if status == "complete" or error is None else str(error),
-        metrics=metrics,
-        record=record,
-    )
+    error = None if status == "complete" or error is None else str(error)
+    overrides = settings(job["overrides"], preset)
+    return Run(job["experiment"], overrides, job["seed"], directory, status, error, metrics, record)
 
 
 def _locate(run_dir: str | None, sweep: Path) -> Path | None:
@@ -267,5 +243,5 @@ def _list(value: Any) -> list[Any]:
 
 def varying(settings: Iterable[tuple[str, ...]]) -> frozenset[str]:
     """The overrides that some of these have and others have not."""
-    sets: list[set[str]] = [set(overrides) for overrides in settings]
-    return frozenset(sets[0].union(*sets) - sets[0].intersection(*sets)) if sets else frozenset()
+    sets = list(map(frozenset, settings)) or [frozenset()]
+    return sets[0].union(*sets) - sets[0].intersection(*sets)

@@ -51,7 +51,7 @@ def cross(cfg: DictConfig) -> dict[str, float]:
 
 
 def _check_trains(cfg: DictConfig) -> None:
-    """Raise a `ValueError` unless the experiment that is said to be trained is configured as this row is.
+    """Raise a `ValueError` unless the experiment that `task.trains` names is configured as this row is.
 
     Without Hydra's own start there is no other experiment to compose: the caller has composed this one.
     """

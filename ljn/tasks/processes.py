@@ -68,7 +68,7 @@ def check_processes(plain: Mapping[str, Any]) -> None:
             )
 
 
-def own_devices(trainer: Mapping[str, Any]) -> dict[str, list[int]]:
+def unclaimed_devices(trainer: Mapping[str, Any]) -> dict[str, list[int]]:
     """For a job of a sweep on a machine with several GPUs: `devices`, one that no other job uses; else nothing.
 
     Jobs that run in parallel would all take the first one.
@@ -114,10 +114,10 @@ def check_trains_in_processes(module: "nn.Module", number: int) -> None:
 
     if number == 1:
         return
-    reason = None
     if not any(parameter.requires_grad for parameter in module.parameters()):
         reason = "a yardstick is fitted in closed form, in seconds, by one process"
     elif any(isinstance(part, _BatchNorm) for part in module.modules()):
-        reason = "the network normalises over the batch, which each process would do over its own part"
-    if reason:
-        raise ValueError(f"trainer.devices: {reason}; use trainer.devices=1, got {number} devices")
+        reason = "the network normalises over the batch, which each process would do over its part alone"
+    else:
+        return
+    raise ValueError(f"trainer.devices: {reason}; use trainer.devices=1, got {number} devices")

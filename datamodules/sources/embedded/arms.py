@@ -129,13 +129,11 @@ def reach(
     to_elbow = to_elbow.expand_as(to_wrist)
     # In the hinge's plane: the angle between the bones by the law of cosines, less what it is at rest.
     flat_elbow, flat_wrist = (torch.hypot(bone[..., 0], bone[..., 2]) for bone in (to_elbow, to_wrist))
-    at_rest = torch.atan2(to_wrist[..., 0], to_wrist[..., 2]) - torch.atan2(
-        to_elbow[..., 0], to_elbow[..., 2]
-    )
+    elbow_turn, wrist_turn = (torch.atan2(bone[..., 0], bone[..., 2]) for bone in (to_elbow, to_wrist))
+    at_rest = wrist_turn - elbow_turn
     along_hinge = to_elbow[..., 1] + to_wrist[..., 1]
-    cosine = (target.square().sum(-1) - along_hinge**2 - flat_elbow**2 - flat_wrist**2) / (
-        2 * flat_elbow * flat_wrist
-    )
+    across = target.square().sum(-1) - along_hinge**2
+    cosine = (across - flat_elbow**2 - flat_wrist**2) / (2 * flat_elbow * flat_wrist)
     narrowest, widest = (math.cos(math.radians(degrees)) for degrees in (_MAX_FLEXION_DEG, _MIN_FLEXION_DEG))
     flexion = cosine.clamp(narrowest, widest).acos()
     hinge = rotation_about("y", -sign * flexion - at_rest)

@@ -53,8 +53,6 @@ RANGES: dict[str, Ranges] = {
     #                            flexion  carrying  forearm's turn
     "elbow": Ranges(ELBOW_AXES, (-150.0, -12.0, -85.0), (5.0, 12.0, 85.0)),
 }
-HINGES: tuple[str, ...] = ("knee", "elbow")
-
 SHOULDER_BACK_DEG = 60.0
 """How far an arm points behind the plane of the chest: extension of 60 degrees with the arm down."""
 SHOULDER_ACROSS_DEG = 50.0
@@ -72,12 +70,9 @@ def _joints(kind: str) -> list[tuple[int, int]]:
 
 
 def _limits_of_side(ranges: Ranges, sign: int) -> tuple[list[float], list[float]]:
-    bounds = [
-        (low, high) if axis == "x" or sign > 0 else (-high, -low)
-        for axis, low, high in zip(ranges.axes, ranges.low, ranges.high)
-    ]
-    low, high = zip(*bounds)
-    return list(low), list(high)
+    bounds = zip(ranges.axes, ranges.low, ranges.high)
+    turned = [(low, high) if axis == "x" or sign > 0 else (-high, -low) for axis, low, high in bounds]
+    return [low for low, _ in turned], [high for _, high in turned]
 
 
 class _Group(NamedTuple):
@@ -98,10 +93,9 @@ def _grouped() -> list[_Group]:
             if ranges.axes == axes
             for joint, sign in _joints(kind)
         ]
-        low, high = (
-            torch.tensor([row[end] for row in rows], dtype=torch.float64).deg2rad() for end in (1, 2)
-        )
-        groups.append(_Group(axes, [row[0] for row in rows], low, high))
+        joints, *limits = (list(column) for column in zip(*rows))
+        low, high = (torch.tensor(limit, dtype=torch.float64).deg2rad() for limit in limits)
+        groups.append(_Group(axes, joints, low, high))
     return groups
 
 

@@ -46,8 +46,7 @@ class MixtureSettings:
 
     def __post_init__(self) -> None:
         for name, shares, known in (("shares", self.shares, KINDS), ("families", self.families, FAMILIES)):
-            unknown = sorted(set(shares) - set(known))
-            if unknown or min(shares.values(), default=0) < 0 or sum(shares.values()) <= 0:
+            if set(shares) - set(known) or min(shares.values(), default=0) < 0 or sum(shares.values()) <= 0:
                 raise ValueError(
                     f"{name}: expected numbers of 0 or more, not all 0, for some of {', '.join(known)}; got "
                     f"{dict(shares)}"
@@ -69,10 +68,10 @@ class PoseMixture:
         self._offsets = joint_offsets(body)
         self._capsules = fit_capsules(body)
         families, kinds = _normalised(settings.families, FAMILIES), _normalised(settings.shares, KINDS)
-        procedural = kinds.pop("procedural", 0.0)
-        self._families = {f"{_PROCEDURAL}{name}": share for name, share in families.items()}
+        share = kinds.pop("procedural", 0.0)
+        self._families = {f"{_PROCEDURAL}{name}": of_family for name, of_family in families.items()}
         self.labels = kinds | {
-            label: procedural * share for label, share in self._families.items() if procedural
+            label: share * of_family for label, of_family in self._families.items() if share
         }
 
     def draw(self, rng: np.random.Generator, n: int) -> Made:
@@ -119,13 +118,10 @@ class PoseMixture:
         is_procedural = np.char.startswith(labels, _PROCEDURAL)
         for kind in KINDS:
             rows = np.flatnonzero(is_procedural if kind == "procedural" else labels == kind)
-            if len(rows):
-                made = (
-                    self._draw_families(rng, labels[rows])
-                    if kind == "procedural"
-                    else self._make(rng, kind, len(rows))
-                )
-                _put(result, rows, made)
+            if len(rows) and kind == "procedural":
+                _put(result, rows, self._draw_families(rng, labels[rows]))
+            elif len(rows):
+                _put(result, rows, self._make(rng, kind, len(rows)))
         return result._replace(rotmat=within_limits(result.rotmat))
 
     def _make(self, rng: np.random.Generator, kind: str, n: int) -> Made:

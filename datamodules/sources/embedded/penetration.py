@@ -105,10 +105,8 @@ def fit_capsules(body: BodyModel) -> Capsules:
 
 def tested_pairs(names: Iterable[str], may_touch: Container[tuple[str, str]]) -> Tensor:
     """All pairs of capsules but those that `may_touch` names, earlier one first: `(2, Q)` long."""
-    pairs = [
-        (i, j) for (i, one), (j, other) in combinations(enumerate(names), 2) if (one, other) not in may_touch
-    ]
-    return torch.tensor(pairs).T
+    pairs = combinations(enumerate(names), 2)
+    return torch.tensor([(i, j) for (i, one), (j, other) in pairs if (one, other) not in may_touch]).T
 
 
 def penetration(world: Tensor, offsets: Tensor, capsules: Capsules) -> Tensor:

@@ -7,23 +7,15 @@ import torch
 from torch import Tensor
 
 from ljn.body.kinematics import SIDES, mirror, without_heading
-from ljn.body.skeleton import JOINT_INDEX, JOINT_NAMES, NUM_JOINTS, ROOT
+from ljn.body.skeleton import JOINT_INDEX, NUM_JOINTS, ROOT
 from ljn.geometry.rotations import interpolate_rotmat, rotvec_to_rotmat
 
-_LEG_NAMES = ("pelvis", "hip", "knee", "ankle", "foot")
-_TRUNK_NAMES = ("spine1", "spine2", "spine3", "neck", "head")
-
-
-def _joints_named(names: tuple[str, ...]) -> tuple[int, ...]:
-    return tuple(JOINT_INDEX[name] for name in JOINT_NAMES if name in names or name[2:] in names)
-
-
-LEGS, TRUNK = _joints_named(_LEG_NAMES), _joints_named(_TRUNK_NAMES)
+TRUNK = tuple(JOINT_INDEX[name] for name in ("spine1", "spine2", "spine3", "neck", "head"))
 LEFT_ARM, RIGHT_ARM = (
     tuple(JOINT_INDEX[f"{side}_{name}"] for name in ("collar", "shoulder", "elbow", "wrist", "hand"))
     for side in SIDES
 )
-"""The parts that change hands: legs with the pelvis, trunk with the head, arms with the collars."""
+"""The parts that are exchanged: trunk with the head, arms with the collars; what is left are the legs."""
 
 
 class Donors(NamedTuple):
@@ -78,16 +70,10 @@ def swapped_poses(
 ) -> Made:
     """Poses whose legs, trunk and arms come from different donors; the pelvis' pitch and roll come with the legs.
 
-    Args:
-        donors: Each part's donor comes from a random one of these tables.
-        blend_share: Share of the trunks and of the arms that lie between two donors: every joint is led by one random
-            amount from the first donor's rotation to the second's.
-        apart_share: Share of the poses whose arms have a donor each.
-        rng: Source of the draws.
-        n: Number of poses.
-
-    Returns:
-        The poses, named "legs|trunk|arms" or "legs|trunk|left arm|right arm", with "first+second" for a blended part.
+    Each part's donor comes from a random one of the tables. A share of the trunks and of the arms is blended: one
+    random amount leads every joint from the first donor's rotation to the second's. A share of the poses has arms that
+    are apart, of a donor each. Names are "legs|trunk|arms" or "legs|trunk|left arm|right arm", with "first+second" for
+    a blended part.
     """
     legs, trunk, left, right = (_draw_from(donors, rng, n) for _ in range(4))
     left, trunk = (_blended(part, _draw_from(donors, rng, n), blend_share, rng) for part in (left, trunk))
@@ -95,15 +81,10 @@ def swapped_poses(
     rotmat = legs.rotmat.clone()
     rotmat[:, list(TRUNK)] = trunk.rotmat[:, list(TRUNK)]
     rotmat[:, list(LEFT_ARM)] = left.rotmat[:, list(LEFT_ARM)]
-    rotmat[:, list(RIGHT_ARM)] = torch.where(
-        torch.from_numpy(is_apart)[:, None, None, None], right.rotmat, left.rotmat
-    )[:, list(RIGHT_ARM)]
-    names = [
-        "|".join([legs_name, trunk_name, left_name] + ([right_name] if apart else []))
-        for legs_name, trunk_name, left_name, right_name, apart in zip(
-            legs.name, trunk.name, left.name, right.name, is_apart
-        )
-    ]
+    arms = torch.where(torch.from_numpy(is_apart)[:, None, None, None], right.rotmat, left.rotmat)
+    rotmat[:, list(RIGHT_ARM)] = arms[:, list(RIGHT_ARM)]
+    parts = zip(legs.name, trunk.name, left.name, right.name)
+    names = ["|".join(names if apart else names[:3]) for names, apart in zip(parts, is_apart)]
     return Made(rotmat, np.array(names), legs.frame)
 
 
@@ -124,9 +105,8 @@ def _draw_from(tables: tuple[Donors, ...], rng: np.random.Generator, n: int) -> 
     for index, table in enumerate(tables[1:], 1):
         made, is_from = whole_poses(table, rng, n), which == index
         rotmat = torch.where(torch.from_numpy(is_from)[:, None, None, None], made.rotmat, result.rotmat)
-        result = Made(
-            rotmat, np.where(is_from, made.name, result.name), np.where(is_from, made.frame, result.frame)
-        )
+        name, frame = np.where(is_from, made.name, result.name), np.where(is_from, made.frame, result.frame)
+        result = Made(rotmat, name, frame)
     return result
 
 

@@ -33,7 +33,7 @@ class ClipMixture:
         clips: The clips.
         split: Names of the clips of each of `SPLITS`.
         settings: How they are mixed.
-        body: The body that poses are made on, whatever bodies wear them.
+        body: The body that poses are made on, whatever bodies are rendered in them.
         max_beta: Shape coefficients are standard normal, drawn again where they exceed this.
         genders: Genders to draw from, keys of `ljn.body.GENDERS`, each equally often.
     """

@@ -122,14 +122,12 @@ def _pierces(start: Array, end: Array, triangle: Array, normal: Array) -> bool:
 def pose_measures(model: BodyModel, vertices: Array) -> dict[str, float]:
     """How a pose changes the mean body: `vertices` `(V, 3)` is that body posed.
 
-    Returns:
-        Percent of change of volume, percent of edges that shrink below half or stretch beyond 1.7 times their
-        length, and the number of faces that pass through others.
+    The change of volume, and the edges that shrink below half or stretch beyond 1.7 times their length, in percent; and
+    the number of faces that pass through others.
     """
     rest, pairs = model.v_template.astype(np.float64), edges(model.faces)
-    ratio = np.linalg.norm(np.subtract(*vertices[pairs.T]), axis=1) / np.linalg.norm(
-        np.subtract(*rest[pairs.T]), axis=1
-    )
+    lengths, rest_lengths = (np.linalg.norm(np.subtract(*body[pairs.T]), axis=1) for body in (vertices, rest))
+    ratio = lengths / rest_lengths
     return {
         "volume": 100 * float(volume(vertices, model.faces) / volume(rest, model.faces) - 1),
         "squeezed": 100 * float((ratio < 0.5).mean()),
