@@ -84,13 +84,13 @@ class Pictures(Callback):
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, *_: int
     ) -> None:
         """Keep the first samples."""
-        missing = self.num_samples - sum(len(kept["error"]) for kept in self._validation)
+        missing = self.num_samples - sum(len(samples["error"]) for samples in self._validation)
         is_wanted = trainer.is_global_zero and trainer.state.fn == TrainerFn.FITTING and self._is_due(trainer)
         if not is_wanted or missing <= 0:
             return
-        kept = {name: batch[name] for name in ("sample_id", *self.inputs) if name in batch}
-        kept |= self.keep(outputs, batch, pl_module)
-        self._validation.append({name: value[:missing].detach().cpu() for name, value in kept.items()})
+        values = {name: batch[name] for name in ("sample_id", *self.inputs) if name in batch}
+        values |= self.keep(outputs, batch, pl_module)
+        self._validation.append({name: value[:missing].detach().cpu() for name, value in values.items()})
 
     @_never_stops
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
@@ -109,8 +109,8 @@ class Pictures(Callback):
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, *_: int
     ) -> None:
         """Keep something of every sample."""
-        kept = self.keep(outputs, batch, pl_module) | {"sample_id": batch["sample_id"]}
-        self._test.append({name: value.detach().cpu() for name, value in kept.items()})
+        values = self.keep(outputs, batch, pl_module) | {"sample_id": batch["sample_id"]}
+        self._test.append({name: value.detach().cpu() for name, value in values.items()})
 
     @_never_stops
     def on_test_end(self, trainer: Trainer, pl_module: LightningModule) -> None:

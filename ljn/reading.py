@@ -17,17 +17,10 @@ from typing import Any
 import numpy as np
 import yaml
 
-try:
-    from lzma import LZMAError
-except ImportError:  # Python can be built without it
-    _LZMA_ERRORS: tuple[type[Exception], ...] = ()
-else:
-    _LZMA_ERRORS = (LZMAError,)
-
 READ_ERRORS: tuple[type[Exception], ...] = (
     ArithmeticError, AttributeError, EOFError, LookupError, MemoryError, OSError, RuntimeError, SyntaxError, TypeError,
     ValueError, pickle.UnpicklingError, struct.error, tokenize.TokenError, yaml.YAMLError, zipfile.BadZipFile,
-    zlib.error, *_LZMA_ERRORS,
+    zlib.error,
 )  # fmt: skip
 """What the functions here, numpy, zipfile, pickle, Pillow, json and yaml raise at damaged files and at those of another
 format: each is to become a `ValueError` that names the file and gives the `reason`."""

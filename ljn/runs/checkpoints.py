@@ -79,29 +79,18 @@ class AtomicCheckpointIO(TorchCheckpointIO):
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """A checkpoint of this library.
+    """A checkpoint of this library."""
 
-    Attributes:
-        path: The file.
-        config: The resolved configuration that the model was trained with.
-        body_hash: Hashes of the bodies that its data showed, joined by "-".
-        data_licence: What is said of the data's licence.
-        run: Name of the directory of the training run.
-        epoch: Epochs completed when it was written.
-        recipe: How the observations that it was trained on were made; None where there were none.
-        state: The module's state dict.
-        file_hash: First 16 hex digits of the file's SHA-256.
-    """
-
-    path: Path
-    config: dict[str, Any]
-    body_hash: str
-    data_licence: str
-    run: str
-    epoch: int
+    path: Path  # the file
+    config: dict[str, Any]  # the resolved configuration that the model was trained with
+    body_hash: str  # hashes of the bodies that its data showed, joined by "-"
+    data_licence: str  # what is said of the data's licence
+    run: str  # name of the directory of the training run
+    epoch: int  # epochs completed when it was written
+    # how the observations that it was trained on were made; None where there were none
     recipe: ObservationRecipe | None
-    state: dict[str, Tensor]
-    file_hash: str
+    state: dict[str, Tensor]  # the module's state dict
+    file_hash: str  # first 16 hex digits of the file's SHA-256
 
     def unknown_bodies(self, hashes: Iterable[str]) -> list[str]:
         """Those of the bodies' hashes that it was not trained with: a model is only meaningful with its bodies."""

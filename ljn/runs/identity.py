@@ -23,15 +23,15 @@ def identity(cfg: DictConfig, data_fingerprint: str) -> dict[str, Any]:
     cfg = cfg.copy()
     with open_dict(cfg):
         cfg.paths.run_dir = ""  # named by what comes of this
-    kept: dict[str, Any] = _of_run(OmegaConf.to_container(cfg, resolve=True))
-    return kept | {"data_fingerprint": data_fingerprint, "predicted_body": predicted_body(cfg)}
+    values: dict[str, Any] = _of_run(OmegaConf.to_container(cfg, resolve=True))
+    return values | {"data_fingerprint": data_fingerprint, "predicted_body": predicted_body(cfg)}
 
 
 def _of_run(value: Any, key: str = "") -> Any:
     """What of a value is the run's; None and empty groups are nothing."""
     if isinstance(value, Mapping):
-        kept = {name: _of_run(entry, f"{key}.{name}".lstrip(".")) for name, entry in value.items()}
-        return {name: entry for name, entry in kept.items() if entry not in (None, {})}
+        entries = {name: _of_run(entry, f"{key}.{name}".lstrip(".")) for name, entry in value.items()}
+        return {name: entry for name, entry in entries.items() if entry not in (None, {})}
     if Key.RUN not in kind_of(key):
         return None
     # In a list every place counts.

@@ -79,5 +79,5 @@ def _trained(cfg: DictConfig, name: str) -> Path:
 
 def _composed(experiment: str) -> DictConfig:
     """The configuration of another experiment with this call's sizes, data, trainer and the like."""
-    kept = [line for line in typed_overrides() if kind_of(key_of(line)).is_shared]
-    return compose("config", [f"experiment={experiment}", *kept])
+    shared = [line for line in typed_overrides() if kind_of(key_of(line)).is_shared]
+    return compose("config", [f"experiment={experiment}", *shared])

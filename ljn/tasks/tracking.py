@@ -53,9 +53,9 @@ def tracking(
 def summaries(config: Mapping[str, Any]) -> dict[str, str]:
     """What of a metric's values a run's summary keeps (`min`, `max` or `last`), but for a test's, logged once."""
     module: Any = get_class(config["module"]["_target_"])
-    kept = {None: "last", False: "min", True: "max"}
+    best = {None: "last", False: "min", True: "max"}
     metrics = module.metrics(prefix="val/").items()
-    return {"train/loss": "min"} | {name: kept[metric.higher_is_better] for name, metric in metrics}
+    return {"train/loss": "min"} | {name: best[metric.higher_is_better] for name, metric in metrics}
 
 
 def log_table(

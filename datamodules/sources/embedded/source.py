@@ -43,11 +43,7 @@ class EmbeddedSource:
         path: The file of clips; the embedded one by default. `.npz` with `poses` `(N, 72)` in SMPL's rest
             frame (y up, z forward) and `clip` `(N,)` names.
         split_path: JSON file of clip names by split; see `read_split`.
-        shares: See `MixtureSettings`, as for all that follow.
-        families: Keys of `FAMILIES`.
-        blend_share: Of trunks and arms.
-        apart_share: Of arms.
-        max_penetration_m: Metres.
+        shares, families, blend_share, apart_share, max_penetration_m: See `MixtureSettings`.
     """
 
     name = "embedded"
