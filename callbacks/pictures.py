@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 
 def _never_stops(hook: Callable[..., None]) -> Callable[..., None]:
-    """A hook of `Pictures` whose errors, whatever they are, become one warning: the run goes on."""
+    """A hook of `Pictures` whose errors of any type become one warning: the run goes on."""
 
     @wraps(hook)
     def guarded(self: "Pictures", *arguments: Any, **keywords: Any) -> None:
@@ -152,7 +152,7 @@ class Pictures(Callback):
 class JointPictures(Pictures):
     """Clouds with true (blue) and predicted (red) skeletons, from the front and from the side; see `Pictures`.
 
-    Joints that only mean something beside the root are moved to the true root first.
+    Joints that are only defined relative to the root are moved to the true root first.
     """
 
     def keep(self, outputs: dict[str, Tensor], batch: Batch, module: Any) -> dict[str, Tensor]:

@@ -11,7 +11,7 @@ from torch.utils.data import BatchSampler, Sampler
 
 
 class EpochSampler(Sampler[tuple[int, int]]):
-    """Indices in an order drawn anew for each epoch, each with the epoch's number beside it.
+    """Pairs of the epoch's number and an index, in an order drawn anew for each epoch.
 
     The number travels with the index, so that workers that live on through epochs draw anew, too.
 
@@ -80,7 +80,7 @@ class ByValue(dict[str, Tensor]):
     """A batch that goes to another process through a pipe, as bytes, and arrives there as a plain dict.
 
     PyTorch would hand tensors over in shared memory. Where `/dev/shm` is small (64 MB in a container), it fills up;
-    the batch is lost and the training process waits for it for ever.
+    the batch is lost and the training process waits for it without end.
     """
 
     def __reduce__(self) -> tuple[Any, ...]:

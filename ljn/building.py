@@ -15,7 +15,7 @@ from ljn.reading import brief, reason
 OWN_MODULES = (
     "ljn.nets.", "ljn.modules.", "ljn.geometry.camera.", "ljn.cloud.observation.", "datamodules.", "callbacks.",
 )  # fmt: skip
-"""Whose classes a config may name."""
+"""The modules whose classes a config may name."""
 _FOREIGN_BASES = {
     "lightning.pytorch.": ("Trainer", "Callback", "loggers.Logger"),
     "torch.optim.": ("Optimizer", "lr_scheduler.LRScheduler"),
@@ -27,8 +27,8 @@ _ALLOWED = (*OWN_MODULES, *_FOREIGN_BASES)
 def check_targets(config: Any, where: str = "") -> None:
     """Raise a `ValueError` if any `_target_` in a plain config names something outside the allow-list.
 
-    What a name leads to counts, not the name alone: `ljn.nets.layers.math.os` is no way out, and a function that
-    calls whatever it is given, such as Lightning's `instantiate_class`, is none either.
+    The object that a name leads to is checked, not the name alone: `ljn.nets.layers.math.os` is refused, and so is a
+    function that calls its arguments, such as Lightning's `instantiate_class`.
     """
     if isinstance(config, Mapping):
         if "_target_" in config:

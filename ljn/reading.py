@@ -142,7 +142,7 @@ def check_archive(content: bytes) -> None:
         entries = archive.infolist()
         if any(entry.compress_type != zipfile.ZIP_STORED for entry in entries):
             raise ValueError("a compressed archive, which PyTorch does not write")
-        # One bit of them calls an entry a folder: PyTorch then takes whatever stands in memory for its content.
+        # One bit of them marks an entry as a folder: PyTorch then takes uninitialised memory for its content.
         if any(entry.external_attr for entry in entries):
             raise ValueError("attributes of files, which PyTorch does not write")
         _check_entries(entries, len(content))
@@ -188,7 +188,7 @@ def check_pickle(content: bytes) -> None:
 def plain_values(content: Any) -> Iterator[Any]:
     """The single values of nested mappings and lists.
 
-    What stands in several places counts, and comes, as often: 30 lists of twice the list before are 2^30 values.
+    A value in several places is yielded, and counted, that often: 30 lists of twice the list before are 2^30 values.
 
     Raises:
         ValueError: Deeper, larger or of other types than a configuration is.

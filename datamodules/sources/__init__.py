@@ -86,7 +86,7 @@ class PoseSource(Protocol):
 
     @property
     def fingerprint(self) -> str:
-        """Hash of all that its records depend on beside the seed: files, splits, settings."""
+        """Hash of all that its records depend on, except the seed: files, splits, settings."""
         ...
 
     @property

@@ -43,7 +43,7 @@ class BodyModel:
         faces: `(F, 3)` int64, vertex indices.
         gender: A key of `GENDERS`.
         path: The file it came from; None if it was built in memory.
-        hash: 16 hex digits that name the arrays' content, whatever file format or precision held them.
+        hash: 16 hex digits that name the arrays' content, independent of file format and stored precision.
     """
 
     v_template: NDArray[np.float32] = field(repr=False)

@@ -196,8 +196,7 @@ class SMPL(nn.Module):
     def _skin(self, slot: int, unposed: Tensor, transforms: Tensor, rest_joints: Tensor) -> Tensor:
         """W of Eq. 3.1: vertices `(B, V, 3)` moved by the weighted mean of the joints' transforms.
 
-        Coordinates come and are worked on as `(B, 3, V)`: with the vertices innermost this takes a quarter
-        of the time on a CPU.
+        Coordinates are `(B, 3, V)` throughout: with the vertices innermost this takes a quarter of the time on a CPU.
         """
         rotation, position = transforms.split([3, 1], dim=-1)
         relative = torch.cat([rotation, position - rotation @ rest_joints[..., None]], dim=-1)

@@ -1,7 +1,7 @@
 """Arrays out of a pickle without running what it names.
 
-A pickle can run any code while it is read. Here none is: whatever the file names is either a plain container or a
-class of this module that only records what it was given; arrays are decoded from those records afterwards. So
+A pickle can run any code while it is read. Here nothing is run: a name in the file becomes either a plain container or
+a class of this module that only records its arguments; arrays are decoded from those records afterwards. So
 files with chumpy arrays and sparse matrices need neither chumpy nor scipy, and a forged one does no harm.
 """
 

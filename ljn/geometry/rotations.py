@@ -173,7 +173,7 @@ def interpolate_rotmat(start: Tensor, end: Tensor, share: Tensor) -> Tensor:
 
 
 def smpl_pose_to_body_world(pose: Tensor) -> Tensor:
-    """A pose that stands in SMPL's own axes (y up, z forward), turned into body world (z up, x forward).
+    """A pose in SMPL's axes (y up, z forward), turned into body world (z up, x forward).
 
     theta_0 <- log(R^T exp(theta_0)) with R of Eq. 3.5; the other joints are relative and stay.
 

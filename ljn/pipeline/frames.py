@@ -1,4 +1,4 @@
-"""Frames one after another, from files or a camera, of which one may fail without harm to the others."""
+"""Frames one after another, from files or a camera; one that fails does not stop the others."""
 
 from collections.abc import Callable, Iterable, Iterator
 from itertools import count, islice, pairwise

@@ -122,7 +122,7 @@ def _read_png(path: Path, name: str) -> np.ndarray:
 
     bombs: tuple[type[Exception], ...] = (Image.DecompressionBombError, Image.DecompressionBombWarning)
     try:
-        # Another format can start a program: PostScript, whatever the file's name, starts Ghostscript.
+        # Another format can start a program: PostScript, also in a file called .png, starts Ghostscript.
         with Image.open(path, formats=("PNG",)) as image:
             if image.width * image.height > MAX_PIXELS:
                 raise ValueError(f"{image.width} x {image.height} pixels, expected at most {MAX_PIXELS}")

@@ -62,7 +62,7 @@ class Comparison:
 
     @property
     def exceeds_spread(self) -> bool | None:
-        """Whether the lead, whatever its sign, is larger than its spread over seeds; None with single seeds."""
+        """Whether the absolute lead is larger than its spread over seeds; None with single seeds."""
         return None if self.spread is None else abs(self.lead) > self.spread
 
 

@@ -24,7 +24,7 @@ class RowResult:
 
     @property
     def is_shared(self) -> bool:
-        """Whether it shows what all runs share, from any of them."""
+        """Whether it shows a value that all runs share, from any of them."""
         return self.row.experiment is None and self.row.overrides is None
 
     @property

@@ -88,7 +88,7 @@ ROOT_ALIGNED_NOTE = (
     "were moved to the same place (test/mpjpe_root_aligned, test/pckh_root_aligned)."
 )
 ROOT_ALIGNED = dict.fromkeys(("mpjpe", "mpjpe_eq38"), "mpjpe_root_aligned") | {"pckh": "pckh_root_aligned"}
-"""What rows of detectors show whose joints only mean something beside the root."""
+"""The metrics of rows of detectors whose joints are only defined relative to the root."""
 _NO_PCKH = {"mpjpe": "initial_mpjpe", "pckh": None}
 
 _NOISE_2D = Axis("σ of the 2D joints' noise, px", "data.synthesis.keypoint_noise_px")

@@ -142,7 +142,7 @@ def sheet(table: TableResult) -> Sheet:
 
 
 def _ours(row: RowResult, cell: Cell) -> Entry:
-    """Our value with its standard deviation over seeds; `failed` or `missing` where there is none, never nothing."""
+    """Our value with its standard deviation over seeds; `failed` or `missing` where there is none."""
     if cell.metric is None:
         return Entry(NONE, "none")
     if cell.mean is None:

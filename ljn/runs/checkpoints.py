@@ -84,7 +84,7 @@ class Checkpoint:
     path: Path  # the file
     config: dict[str, Any]  # the resolved configuration that the model was trained with
     body_hash: str  # hashes of the bodies that its data showed, joined by "-"
-    data_licence: str  # what is said of the data's licence
+    data_licence: str  # one line on the data's licence
     run: str  # name of the directory of the training run
     epoch: int  # epochs completed when it was written
     # how the observations that it was trained on were made; None where there were none

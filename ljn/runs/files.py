@@ -21,7 +21,7 @@ def write_json(path: Path, content: Mapping[str, Any]) -> None:
 
 
 def write_text_atomically(path: Path, text: str) -> None:
-    """Write a text file, whole or not at all: after a failure the old one is there, and nothing beside it."""
+    """Write a text file, whole or not at all: after a failure the old file is unchanged and no draft is left."""
     # Jobs side by side write the same files, each in a process of its own.
     draft = path.with_name(f"{path.name}.{os.getpid()}.tmp")
     try:

@@ -22,13 +22,13 @@ def identity(cfg: DictConfig, data_fingerprint: str) -> dict[str, Any]:
     """
     cfg = cfg.copy()
     with open_dict(cfg):
-        cfg.paths.run_dir = ""  # named by what comes of this
+        cfg.paths.run_dir = ""  # its name depends on the identity
     values: dict[str, Any] = _of_run(OmegaConf.to_container(cfg, resolve=True))
     return values | {"data_fingerprint": data_fingerprint, "predicted_body": predicted_body(cfg)}
 
 
 def _of_run(value: Any, key: str = "") -> Any:
-    """What of a value is the run's; None and empty groups are nothing."""
+    """The part of a value that belongs to the run's identity; None where nothing does."""
     if isinstance(value, Mapping):
         entries = {name: _of_run(entry, f"{key}.{name}".lstrip(".")) for name, entry in value.items()}
         return {name: entry for name, entry in entries.items() if entry not in (None, {})}
@@ -49,6 +49,6 @@ def predicted_body(cfg: DictConfig) -> str | None:
 
 
 def config_hash(plain: Mapping[str, Any]) -> str:
-    """First 8 hex digits of the SHA-256 of plain values, whatever the order of their keys; 10 and 10.0 agree."""
+    """First 8 hex digits of the SHA-256 of plain values, independent of the keys' order; 10 and 10.0 agree."""
     canonical = map_floats(plain, lambda number: int(number) if number.is_integer() else number)
     return hashlib.sha256(json.dumps(canonical, sort_keys=True).encode()).hexdigest()[:8]

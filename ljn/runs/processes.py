@@ -1,4 +1,4 @@
-"""The processes of one run, of which the first one alone writes, and how a signal ends them."""
+"""The processes of one run (only the first one writes files), and how a signal ends them."""
 
 import math
 import os

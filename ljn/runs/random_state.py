@@ -9,7 +9,7 @@ _KEY = "random_state"
 
 
 class RandomState(Callback):
-    """Keeps the state of PyTorch's global generators in checkpoints, and goes on from it when a run is resumed."""
+    """Keeps the state of PyTorch's global generators in checkpoints, and restores it when a run is resumed."""
 
     def __init__(self) -> None:
         self._resumed: dict[str, torch.Tensor] = {}

@@ -68,7 +68,7 @@ class Run:
 
     @property
     def is_root_relative(self) -> bool:
-        """Whether only its joints' positions beside the root mean something, as the record says."""
+        """Whether its joints are only defined relative to the root, as the record says."""
         return self.record.get("is_root_relative") is True
 
     @property

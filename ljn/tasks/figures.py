@@ -48,7 +48,7 @@ def figures(cfg: DictConfig) -> dict[str, float]:
 
     Returns:
         The mean error of the drawn samples in each column, as `figures/joints_0` and so on, mm: MPJPE (root-aligned
-        for a detector whose joints only mean something beside the root) and APVE.
+        for a detector whose joints are only defined relative to the root) and APVE.
 
     Raises:
         ValueError: No checkpoint is given, one is of the other stage, or their test sets differ.

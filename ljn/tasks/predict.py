@@ -35,8 +35,8 @@ _COMMAND = (
 def predict(cfg: DictConfig) -> dict[str, float]:
     """Predict joints and meshes of a depth image, or of each in a folder, into `output_dir/predictions/NAME`.
 
-    A frame of a folder that cannot be predicted is reported and costs the others nothing. `predictions.json` says
-    what became of each frame.
+    A frame of a folder that cannot be predicted is reported, and all others are predicted. `predictions.json` lists
+    each frame's outcome.
 
     Args:
         cfg: The composed configuration; of it `task`, `ckpt_path`, `paths`, `num_threads` and `trainer.accelerator`

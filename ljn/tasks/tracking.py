@@ -17,7 +17,7 @@ from ljn.runs.identity import config_hash
 def tracking(
     trainer: lightning.Trainer, run_id: str, config: Mapping[str, Any], trained_by: str | None = None
 ) -> Iterator[None]:
-    """While it lasts, the trainer's loggers follow one run; then W&B's run is ended, as failed after an error.
+    """A context in which the trainer's loggers follow one run; at its end W&B's run ends, as failed after an error.
 
     Without that end, jobs of one process would share a run. W&B's job type is `train` or `evaluate`; of a
     validation metric its summary keeps the best value. An evaluation has the directory and W&B's id of its
@@ -51,7 +51,7 @@ def tracking(
 
 
 def summaries(config: Mapping[str, Any]) -> dict[str, str]:
-    """What of a metric's values a run's summary keeps (`min`, `max` or `last`), but for a test's, logged once."""
+    """Which of a validation metric's values a run's summary keeps: `min`, `max` or `last`."""
     module: Any = get_class(config["module"]["_target_"])
     best = {None: "last", False: "min", True: "max"}
     metrics = module.metrics(prefix="val/").items()

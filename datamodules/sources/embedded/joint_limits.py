@@ -116,7 +116,7 @@ def within_limits(rotmat: Tensor) -> Tensor:
 
 
 def _shoulder_within_limits(rotmat: Tensor, sign: int) -> Tensor:
-    """One shoulder's rotations `(n, 3, 3)` with the upper arm led back to where arms point, and its twist held."""
+    """One shoulder's rotations `(n, 3, 3)` with the upper arm's direction and its twist held within limits."""
     arm = torch.tensor([float(sign), 0.0, 0.0], dtype=rotmat.dtype)
     swing, twist = swing_twist(rotmat, arm)
     inward = sign * twist

@@ -153,6 +153,6 @@ def _put(poses: Made, rows: np.ndarray, others: Made) -> None:
 
 
 def _normalised(shares: Mapping[str, float], known: Iterable[str]) -> dict[str, float]:
-    """Those of the shares that are not zero, summing to 1, in one order whatever order they were given in."""
+    """The shares that are not zero, normalised to a sum of 1, in the order of `known`."""
     total = sum(shares.values())
     return {name: shares[name] / total for name in known if shares.get(name, 0) > 0}

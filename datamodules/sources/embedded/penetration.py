@@ -23,7 +23,7 @@ class _Part(NamedTuple):
 
 
 # The trunk is wider than deep: three capsules across, one above the other, fill it. An upper arm begins in the chest;
-# only its lower half can be told to be in the wrong place.
+# only its lower half can be detected in a wrong place.
 _PARTS = {
     "pelvis": _Part("pelvis", ("pelvis",), "x"),
     "waist": _Part("spine1", ("spine1",), "x"),

@@ -89,7 +89,7 @@ def swapped_poses(
 
 
 def _blended(one: Made, other: Made, share: float, rng: np.random.Generator) -> Made:
-    """A `share` of the poses led a random part of the way to others."""
+    """Poses of which a `share` is interpolated, by a random amount, towards others."""
     rows = np.flatnonzero(rng.random(len(one.name)) < share)
     amount = torch.from_numpy(rng.random(len(rows)))[:, None]
     rotmat, name = one.rotmat.clone(), one.name.astype(object)

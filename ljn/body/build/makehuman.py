@@ -108,7 +108,7 @@ class MakeHuman:
 
 
 def _read_obj(path: Path) -> tuple[Array, dict[str, list[list[int]]]]:
-    """Vertices as they stand and the polygons of each group; every other kind of line is left out."""
+    """Vertices in the file's unit and the polygons of each group; every other kind of line is left out."""
     vertices: list[list[float]] = []
     groups: dict[str, list[list[int]]] = {}
     faces: list[list[int]] = []

@@ -18,8 +18,8 @@ def smallest_eigenvector(
     return null_vector(xx, xy, xz, yy, yz, zz, smallest_eigenvalue(spread, cosine))
 
 
-# The parts of the solution. Those without a branch, of which a loop over many matrices makes vector instructions,
-# divide by zero where what comes of it is not used.
+# The parts of the solution. Those without a branch, so that a loop over many matrices is compiled to vector
+# instructions, divide by zero where the quotient is not used.
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
