@@ -47,9 +47,7 @@ class Comparison:
     worse: str  # label of the other one
     is_claim: bool  # whether it is the thesis that puts it first
     is_adjacent: bool  # whether no row of the thesis lies between the two
-    lead: (
-        float  # by how much `better` is better in our runs, in the column's unit; negative where it is worse
-    )
+    lead: float  # how much better `better` is in our runs, in the column's unit; negative where it is worse
     spread: float | None  # standard deviation of the lead over seeds; None where a row has fewer than two
     # 95 % interval of the lead over test samples, by a paired bootstrap; None where its values of the same samples are
     # not known for both

@@ -146,9 +146,7 @@ class Sweep:
     preset: str  # the sizes, such as `small`
     tables: tuple[str, ...]  # names of the tables that it fills
     command: str  # what started it
-    runs: tuple[
-        Run, ...
-    ]  # in the order of the jobs; of those of equal experiment, settings and seed, the first
+    runs: tuple[Run, ...]  # in the jobs' order; of those of equal experiment, settings and seed, the first
 
 
 def read_sweep(directory: Path) -> Sweep:

@@ -122,9 +122,7 @@ def penetration(world: Tensor, offsets: Tensor, capsules: Capsules) -> Tensor:
     """
     moved = (world[:, capsules.joints] * capsules.ends[..., None, :]).sum(-1)  # (n, P, 2, 3)
     ends = joint_positions(world, offsets)[:, capsules.joints] + moved
-    start, end = ends.permute(
-        2, 3, 0, 1
-    )  # (3, n, P) each: with coordinates outermost this takes half the time
+    start, end = ends.permute(2, 3, 0, 1)  # (3, n, P) each: coordinates outermost take half the time
     one, other = capsules.pairs
     distance = segment_distance(start[..., one], end[..., one], start[..., other], end[..., other])
     return capsules.radii[capsules.pairs].sum(0) - distance

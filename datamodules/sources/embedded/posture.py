@@ -57,14 +57,12 @@ class Posture:
     thigh: np.ndarray  # `(n, 2)`, forward of straight down; the hip flexes by this and the pelvis' pitch
     knee: np.ndarray  # `(n, 2)`, flexion
     goals: np.ndarray  # `(n, 2)`, indices into `GOALS`
-    # `(n, 2)`, how far the toes are raised above level, legs that are spread and turned out left aside
-    foot: np.ndarray | float = 0.0
+    foot: np.ndarray | float = 0.0  # `(n, 2)`, how far toes are raised above level (without spread, turnout)
     spread: np.ndarray | float = 0.0  # `(n, 2)`, how far the legs are out of the vertical, to their sides
     turnout: np.ndarray | float = 0.0  # `(n, 2)`, hips' outward rotation
     pitch: np.ndarray | float = 0.0  # `(n,)`, of the pelvis, forward
     roll: np.ndarray | float = 0.0  # `(n,)`, of the pelvis, to the right
-    # `(n,)`, of the pelvis about the trunk's own axis, to the left: onto a side when lying
-    turn: np.ndarray | float = 0.0
+    turn: np.ndarray | float = 0.0  # `(n,)`, of the pelvis about the trunk's axis, to the left
     bend: np.ndarray | float = 0.0  # `(n,)`, of the spine, forward
     twist: np.ndarray | float = 0.0  # `(n,)`, of the spine, to the left
     lean: np.ndarray | float = 0.0  # `(n,)`, of the spine, to the right
