@@ -13,7 +13,7 @@ from lightning.pytorch.loggers import WandbLogger
 from lightning.pytorch.trainer.states import TrainerFn
 from torch import Tensor
 
-from callbacks.gathering import gather_samples
+from callbacks.gathering import gather_samples, join_batches
 from ljn.body.skeleton import ROOT
 from ljn.data import Batch
 from ljn.drawing import MeshSample, Sample, clouds, draw_meshes, draw_samples
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 
 def _never_stops(hook: Callable[..., None]) -> Callable[..., None]:
-    """A hook of `Pictures` whose errors, whatever they are, become one warning: the run goes on."""
+    """A hook of `Pictures` whose errors of any type become one warning: the run goes on."""
 
     @wraps(hook)
     def guarded(self: "Pictures", *arguments: Any, **keywords: Any) -> None:
@@ -55,7 +55,7 @@ class Pictures(Callback):
         every_n_epochs: Epochs between two validation pictures.
     """
 
-    inputs: ClassVar[tuple[str, ...]]
+    inputs: ClassVar[tuple[str, ...]] = ("points", "crop", "crop_camera")
 
     def __init__(self, directory: str | Path, num_samples: int = 4, every_n_epochs: int = 5) -> None:
         self.directory = Path(directory)
@@ -81,55 +81,42 @@ class Pictures(Callback):
 
     @_never_stops
     def on_validation_batch_end(
-        self,
-        trainer: Trainer,
-        pl_module: LightningModule,
-        outputs: Any,
-        batch: Any,
-        batch_idx: int,
-        dataloader_idx: int = 0,
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, *_: int
     ) -> None:
         """Keep the first samples."""
-        missing = self.num_samples - sum(len(kept["error"]) for kept in self._validation)
+        missing = self.num_samples - sum(len(samples["error"]) for samples in self._validation)
         is_wanted = trainer.is_global_zero and trainer.state.fn == TrainerFn.FITTING and self._is_due(trainer)
         if not is_wanted or missing <= 0:
             return
-        kept = {name: batch[name] for name in ("sample_id", *self.inputs) if name in batch}
-        kept |= self.keep(outputs, batch, pl_module)
-        self._validation.append({name: value[:missing].detach().cpu() for name, value in kept.items()})
+        values = {name: batch[name] for name in ("sample_id", *self.inputs) if name in batch}
+        values |= self.keep(outputs, batch, pl_module)
+        self._validation.append({name: value[:missing].detach().cpu() for name, value in values.items()})
 
     @_never_stops
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Draw them."""
-        kept, self._validation = self._validation, []
-        if kept:
-            samples = _join(kept)
-            titles = [
-                f"sample {int(number)}: {float(error):.0f} {self.unit(pl_module)}"
-                for number, error in zip(samples["sample_id"], samples["error"])
-            ]
-            figure = self.draw(samples, titles, self.num_samples, pl_module)
+        batches, self._validation = self._validation, []
+        if batches:
+            samples = join_batches(batches)
+            numbers = [f"sample {int(number)}" for number in samples["sample_id"]]
+            figure = self.draw(
+                samples, self._titles(numbers, samples, pl_module), self.num_samples, pl_module
+            )
             self._save(trainer, figure, "val/samples", f"val_epoch_{trainer.current_epoch + 1:03d}.png")
 
     @_never_stops
     def on_test_batch_end(
-        self,
-        trainer: Trainer,
-        pl_module: LightningModule,
-        outputs: Any,
-        batch: Any,
-        batch_idx: int,
-        dataloader_idx: int = 0,
+        self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, *_: int
     ) -> None:
         """Keep something of every sample."""
-        kept = self.keep(outputs, batch, pl_module) | {"sample_id": batch["sample_id"]}
-        self._test.append({name: value.detach().cpu() for name, value in kept.items()})
+        values = self.keep(outputs, batch, pl_module) | {"sample_id": batch["sample_id"]}
+        self._test.append({name: value.detach().cpu() for name, value in values.items()})
 
     @_never_stops
     def on_test_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Draw the best, the median and the worst samples on a page."""
-        kept, self._test = self._test, []
-        samples = gather_samples(kept)
+        batches, self._test = self._test, []
+        samples = gather_samples(batches)
         if not samples or not trainer.is_global_zero:
             return
         order = samples["error"].nan_to_num(nan=torch.inf).argsort().tolist()
@@ -141,13 +128,13 @@ class Pictures(Callback):
         read: Any = trainer.test_dataloaders
         again = read.dataset.__getitems__(drawn["sample_id"].tolist())
         drawn |= {name: again[name] for name in self.inputs if name in again}
-        titles = [
-            f"{kind}: {float(samples['error'][index]):.0f} {self.unit(pl_module)}"
-            for kind, indices in kinds.items()
-            for index in indices
-        ]
-        figure = self.draw(drawn, titles, number, pl_module)
+        names = [kind for kind, indices in kinds.items() for _ in indices]
+        figure = self.draw(drawn, self._titles(names, drawn, pl_module), number, pl_module)
         self._save(trainer, figure, "test/extremes", layout.EXTREMES)
+
+    def _titles(self, names: Sequence[str], samples: dict[str, Tensor], module: Any) -> list[str]:
+        errors = samples["error"].tolist()
+        return [f"{name}: {error:.0f} {self.unit(module)}" for name, error in zip(names, errors)]
 
     def _is_due(self, trainer: Trainer) -> bool:
         epoch = trainer.current_epoch + 1
@@ -165,10 +152,8 @@ class Pictures(Callback):
 class JointPictures(Pictures):
     """Clouds with true (blue) and predicted (red) skeletons, from the front and from the side; see `Pictures`.
 
-    Joints that only mean something beside the root are moved to the true root first.
+    Joints that are only defined relative to the root are moved to the true root first.
     """
-
-    inputs = ("points", "crop", "crop_camera")
 
     def keep(self, outputs: dict[str, Tensor], batch: Batch, module: Any) -> dict[str, Tensor]:
         """See `Pictures.keep`."""
@@ -193,20 +178,12 @@ class JointPictures(Pictures):
 class MeshPictures(Pictures):
     """Predicted (red) beside true (blue) meshes with the cloud over them, front and side; see `Pictures`."""
 
-    inputs = ("points", "crop", "crop_camera")
-
     def keep(self, outputs: dict[str, Tensor], batch: Batch, module: Any) -> dict[str, Tensor]:
         """See `Pictures.keep`: parameters and roots, from which the meshes are made again."""
-        return {
-            "error": outputs["apve"],
-            "pred_pose": outputs["pred_pose"],
-            "pred_betas": outputs["pred_betas"],
-            "pose": batch["pose"],
-            "betas": batch["betas"],
-            "gender": batch["gender"],
-            "pred_root": outputs["pred_joints"][:, ROOT],
-            "root": batch["joints"][:, ROOT],
-        }
+        roots = {"pred_root": outputs["pred_joints"][:, ROOT], "root": batch["joints"][:, ROOT]}
+        parameters = {name: outputs[name] for name in ("pred_pose", "pred_betas")}
+        truth = {"pose": batch["pose"], "betas": batch["betas"], "gender": batch["gender"]}
+        return {"error": outputs["apve"], **parameters, **truth, **roots}
 
     @torch.no_grad()
     def draw(
@@ -223,7 +200,3 @@ class MeshPictures(Pictures):
             meshes.append(place_at_root(vertices, joints[:, ROOT], on_device[root]).cpu().numpy())
         rows = zip(clouds(samples), *meshes, titles)
         return draw_meshes([MeshSample(*row) for row in rows], module.body.faces.cpu().numpy(), num_columns)
-
-
-def _join(parts: list[dict[str, Tensor]]) -> dict[str, Tensor]:
-    return {name: torch.cat([part[name] for part in parts]) for name in parts[0]}

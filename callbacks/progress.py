@@ -10,12 +10,7 @@ from torch import Tensor
 
 
 class Progress(TQDMProgressBar):
-    """Bars on a terminal, and everywhere one line for each epoch.
-
-    Args:
-        metric: The validation metric to show.
-        refresh_rate: Batches between two refreshes of a bar.
-    """
+    """Bars on a terminal, and everywhere one line for each epoch, with a validation metric."""
 
     def __init__(self, metric: str, refresh_rate: int = 10) -> None:
         super().__init__(refresh_rate=refresh_rate if sys.stdout.isatty() else 0)

@@ -19,9 +19,6 @@ class SampleErrors(Callback):
     under the metric's key, and what the module says is stored beside them (`truth` and `stored` of `StageModule`): of
     both stages, `joints`, `pred_joints` and `initial_joints` `(S, 24, 3)` in metres, camera frame; of a mesh regressor
     also `pred_pose` `(S, 72)` and `pred_betas` `(S, 10)`.
-
-    Args:
-        directory: Where the file goes.
     """
 
     def __init__(self, directory: str | Path) -> None:
@@ -29,18 +26,12 @@ class SampleErrors(Callback):
         self._batches: list[dict[str, Tensor]] = []
 
     def on_test_batch_end(  # type: ignore[override]
-        self,
-        trainer: Trainer,
-        pl_module: StageModule,
-        outputs: Any,
-        batch: Any,
-        batch_idx: int,
-        dataloader_idx: int = 0,
+        self, trainer: Trainer, pl_module: StageModule, outputs: Any, batch: Any, *_: int
     ) -> None:
         """Keep what is stored of a batch."""
         names = ("sample_id", *pl_module.truth, *pl_module.stored, *pl_module.metrics.table)
-        kept = {name: outputs[name] if name in outputs else batch[name] for name in names}
-        self._batches.append({name: value.detach().cpu() for name, value in kept.items()})
+        values = {name: outputs[name] if name in outputs else batch[name] for name in names}
+        self._batches.append({name: value.detach().cpu() for name, value in values.items()})
 
     def on_test_end(self, trainer: Trainer, pl_module: StageModule) -> None:  # type: ignore[override]
         """Write the file."""

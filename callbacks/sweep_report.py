@@ -26,9 +26,6 @@ class SweepReport(Callback):
     After every job, so that neither a failure nor a kill costs what is there: `sweep.json`, which names the runs, and
     the tables as files. At the end also `report.html`, and the tables are printed. Each job leaves a note in Hydra's
     sweep directory, since jobs may run in processes of their own.
-
-    Args:
-        output_dir: `paths.output_dir`.
     """
 
     def __init__(self, output_dir: str | Path) -> None:
@@ -52,28 +49,28 @@ class SweepReport(Callback):
             error = job_return._return_value  # reading `return_value` would raise it
             self._note(config, run_dir=run_dir, status="failed", error=f"{type(error).__name__}: {error}")
         write_report(self._gather(config), is_final=False)
-        self._see_to_the_end()
+        self._sum_up_at_exit()
 
     def _note(self, config: DictConfig, **outcome: str | None) -> None:
         """Write a job's note, which takes the place of an earlier one."""
         notes = self._notes(config)
         notes.mkdir(parents=True, exist_ok=True)
-        job = {
-            "experiment": config.hydra.runtime.choices.get("experiment"),
-            "overrides": list(config.hydra.overrides.task),
-            "seed": config.seed,
-        }
+        experiment, overrides = (
+            config.hydra.runtime.choices.get("experiment"),
+            list(config.hydra.overrides.task),
+        )
+        job = {"experiment": experiment, "overrides": overrides, "seed": config.seed}
         write_json(notes / f"{int(config.hydra.job.num):04d}.json", job | outcome)
 
     def on_multirun_start(self, config: DictConfig, **kwargs: Any) -> None:
-        """See to it that the sweep is summed up however it ends."""
+        """Make sure that the sweep is summed up however it ends."""
         # No copy: a copy's `now` is another time, and its directory another one.
         self._sweep = config
         config.group = config.group or sweep_name(config.hydra)
-        self._see_to_the_end()
+        self._sum_up_at_exit()
 
-    def _see_to_the_end(self) -> None:
-        """After a failed job, Hydra says nothing of the sweep's end."""
+    def _sum_up_at_exit(self) -> None:
+        """After a failed job, Hydra does not call `on_multirun_end`."""
         if self._sweep is not None:  # in the process that runs the sweep
             # Again after every job: what is registered last is called first, while the tracker still works.
             atexit.unregister(self._sum_up)
@@ -99,9 +96,8 @@ class SweepReport(Callback):
         jobs = read_jobs(directory)
         directories = {str(job["run_dir"]) for job in jobs if job["run_dir"]}
         num_runs = sum(run.startswith("runs") for run in directories)
-        print(
-            f"\n{report.text}\n\n{len(jobs)} jobs: {num_runs} runs, {len(directories) - num_runs} evaluations"
-        )
+        num_evaluations = len(directories) - num_runs
+        print(f"\n{report.text}\n\n{len(jobs)} jobs: {num_runs} runs, {num_evaluations} evaluations")
         print("\n".join(map(str, report.paths)), flush=True)
         # Not above: Hydra imports this file for every call, also for one that should not load PyTorch.
         from ljn.tasks.tracking import log_table
@@ -131,11 +127,12 @@ class SweepReport(Callback):
             row, seed = _key(job, preset)
             if (row, seed) not in known and (job["status"] == "complete" or row in rows):
                 jobs.append(job)
+        command = shlex.join(["python", "run.py", *sys.argv[1:]])
         content = {
             "name": name,
             "preset": preset,
             "tables": list(config.tables),
-            "command": shlex.join(["python", "run.py", *sys.argv[1:]]),
+            "command": command,
             "jobs": jobs,
         }
         write_json(directory / layout.SWEEP, content)

@@ -11,9 +11,9 @@ from torch.utils.data import BatchSampler, Sampler
 
 
 class EpochSampler(Sampler[tuple[int, int]]):
-    """Indices in an order drawn anew for each epoch, each with the epoch's number beside it.
+    """Pairs of the epoch's number and an index, in an order drawn anew for each epoch.
 
-    The number travels with the index, so that workers that live on through epochs draw anew without being told.
+    The number travels with the index, so that workers that live on through epochs draw anew, too.
 
     Args:
         num_samples: Samples in an epoch.
@@ -43,13 +43,7 @@ class EpochSampler(Sampler[tuple[int, int]]):
 
 
 class SharedBatches(Sampler[list[Any]]):
-    """One process's equal part of every batch, so that several processes take the steps that one would take.
-
-    Args:
-        batches: The whole batches.
-        process: This process's number.
-        num_processes: How many there are.
-    """
+    """One process's equal part of every batch, so that several processes take the steps that one would take."""
 
     def __init__(self, batches: BatchSampler, process: int = 0, num_processes: int = 1) -> None:
         self.batches = batches
@@ -73,25 +67,20 @@ def fixed_batches(size: int, batch_size: int, process: int = 0, num_processes: i
     """A process's batches of the indices of a fixed set: each index in one process only, and in one batch.
 
     All processes have the same number of batches and none is empty, since each may wait for the others in each.
-
-    Args:
-        size: Samples in the set, at least `num_processes`.
-        batch_size: Samples in the processes' batches together.
-        process: This process's number.
-        num_processes: How many there are.
+    `batch_size` counts the samples of the processes' batches together.
     """
     if num_processes == 1:
         return [list(range(start, min(start + batch_size, size))) for start in range(0, size, batch_size)]
-    own = np.array_split(np.arange(size), num_processes)[process]
+    indices = np.array_split(np.arange(size), num_processes)[process]
     number = min(-(-size // batch_size), size // num_processes)
-    return [part.tolist() for part in np.array_split(own, number)]
+    return [part.tolist() for part in np.array_split(indices, number)]
 
 
 class ByValue(dict[str, Tensor]):
     """A batch that goes to another process through a pipe, as bytes, and arrives there as a plain dict.
 
     PyTorch would hand tensors over in shared memory. Where `/dev/shm` is small (64 MB in a container), it fills up;
-    the batch is lost and the training process waits for it for ever.
+    the batch is lost and the training process waits for it without end.
     """
 
     def __reduce__(self) -> tuple[Any, ...]:

@@ -17,18 +17,13 @@ from ljn.reading import READ_ERRORS, read_json, reason
 
 
 def cached_samples(directory: Path, key: str, make: Callable[[], Mapping[str, Tensor]]) -> dict[str, Tensor]:
-    """The samples stored under `key`, made and stored first where they are missing.
+    """The samples stored in `directory` under `key`, made and stored first where they are missing.
+
+    The key is a hash of all that the samples depend on; these are tensors with the same first dimension, backed by the
+    files and read when they are touched.
 
     A set is written beside its place and then renamed into it: it is there whole or not at all, also when two
     processes make it at once (the second one's copy is dropped). A damaged set is made anew, with a warning.
-
-    Args:
-        directory: Where sets are kept.
-        key: Hash of all that the samples depend on.
-        make: Gives the samples: tensors with the same first dimension.
-
-    Returns:
-        Tensors backed by the files, read when they are touched.
     """
     place = directory / key
     if place.is_dir():

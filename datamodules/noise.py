@@ -8,13 +8,9 @@ JOINT_NOISES = ("planar", "isotropic")
 def add_depth_noise(
     depth: np.ndarray, noise_std_m: float, rng: np.random.Generator, in_place: bool = False
 ) -> np.ndarray:
-    """A depth image with Gaussian noise on the body's pixels (section 3.6.1).
+    """A depth image `(H, W)` float32, metres, with Gaussian noise on the body (section 3.6.1); 0 stays 0.
 
-    Args:
-        depth: `(H, W)` float32, metres; 0 is background and stays 0.
-        noise_std_m: Standard deviation, metres.
-        rng: Source of the draws; they do not depend on `noise_std_m`.
-        in_place: Whether `depth` itself gets the noise, or a copy.
+    The draws do not depend on `noise_std_m`, metres. With `in_place`, `depth` itself gets the noise, else a copy.
     """
     noisy = depth if in_place else depth.copy()
     flat = noisy.reshape(-1)
@@ -24,15 +20,9 @@ def add_depth_noise(
 
 
 def add_keypoint_noise(keypoints: np.ndarray, noise_px: float, rng: np.random.Generator) -> np.ndarray:
-    """2D keypoints as a detector might give them; they may lie outside the image.
+    """2D keypoints `(K, 2)` as a detector might give them, float32, pixels; they may lie outside the image.
 
-    Args:
-        keypoints: `(K, 2)`, pixels.
-        noise_px: Standard deviation of the Gaussian noise on u and on v, pixels.
-        rng: Source of the draws; they do not depend on `noise_px`.
-
-    Returns:
-        `(K, 2)` float32.
+    The draws do not depend on `noise_px`, the standard deviation of the Gaussian noise on u and on v, pixels.
     """
     return (keypoints + noise_px * rng.standard_normal(keypoints.shape)).astype(np.float32)
 

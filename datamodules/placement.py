@@ -12,12 +12,10 @@ HEADINGS = ("source", "histogram", "uniform")
 
 
 def draw_heading(kind: str, rng: np.random.Generator) -> float:
-    """Angle about the vertical, radians in [-pi, pi]; 0 faces the camera.
+    """Angle about the vertical, radians in [-pi, pi]; 0 faces the camera. Every kind takes as many draws.
 
-    Args:
-        kind: `histogram` (62 % within +-45 degrees, 21 % beyond +-135, 17 % between, flat in each), `uniform`,
-            or `source` (no turn: the pose's own heading stays).
-        rng: Source of the draws; every kind takes as many.
+    Kinds are `histogram` (62 % within +-45 degrees, 21 % beyond +-135, 17 % between, flat in each), `uniform`, and
+    `source` (no turn: the heading of the pose stays).
     """
     choice, position, sign = rng.random(3)
     if kind == "source":
@@ -73,10 +71,9 @@ def place(
     centre = (z.min() + z.max()) / 2
     depth = distance_m[0] + uniform[2] * (distance_m[1] - distance_m[0]) - centre
     # Slopes of the picture's borders, less the margin: x in [left, right] * depth is in the picture.
+    axes = ((camera.fx, camera.cx, camera.width), (camera.fy, camera.cy, camera.height))
     borders = []
-    for axis, (focal, middle, size) in enumerate(
-        ((camera.fx, camera.cx, camera.width), (camera.fy, camera.cy, camera.height))
-    ):
+    for axis, (focal, middle, size) in enumerate(axes):
         low, high = (margin_px - middle) / focal, (size - 1 - margin_px - middle) / focal
         from_low = (low * z - vertices[:, axis]).max()
         to_high = (high * z - vertices[:, axis]).min()
@@ -87,15 +84,3 @@ def place(
         for axis, (low, high, from_low, to_high) in enumerate(borders)
     ]
     return np.array([*shift, depth])
-
-
-def floor_height(vertices: np.ndarray) -> np.ndarray:
-    """Height of the floor that touches each mesh from below: its lowest vertex.
-
-    Args:
-        vertices: `(..., V, 3)`, metres, body world (z up).
-
-    Returns:
-        `(...)`, metres.
-    """
-    return vertices[..., 2].min(-1)

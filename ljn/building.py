@@ -15,7 +15,7 @@ from ljn.reading import brief, reason
 OWN_MODULES = (
     "ljn.nets.", "ljn.modules.", "ljn.geometry.camera.", "ljn.cloud.observation.", "datamodules.", "callbacks.",
 )  # fmt: skip
-"""Whose classes a config may name."""
+"""The modules whose classes a config may name."""
 _FOREIGN_BASES = {
     "lightning.pytorch.": ("Trainer", "Callback", "loggers.Logger"),
     "torch.optim.": ("Optimizer", "lr_scheduler.LRScheduler"),
@@ -27,8 +27,8 @@ _ALLOWED = (*OWN_MODULES, *_FOREIGN_BASES)
 def check_targets(config: Any, where: str = "") -> None:
     """Raise a `ValueError` if any `_target_` in a plain config names something outside the allow-list.
 
-    What a name leads to counts, not the name alone: `ljn.nets.layers.math.os` is no way out, and a function that
-    calls whatever it is given, such as Lightning's `instantiate_class`, is none either.
+    The object that a name leads to is checked, not the name alone: `ljn.nets.layers.math.os` is refused, and so is a
+    function that calls its arguments, such as Lightning's `instantiate_class`.
     """
     if isinstance(config, Mapping):
         if "_target_" in config:
@@ -46,17 +46,19 @@ def _check_target(target: str, where: str) -> None:
     if not target.startswith(_ALLOWED):
         raise ValueError(f"{where}: {named} is outside the modules that a config may name: {allowed}")
     try:
-        found = _find(target)
+        target_class = _find(target)
     except (ImportError, AttributeError, ValueError) as error:  # a name with an empty part
         raise ValueError(f"{where}: {named} cannot be found ({reason(error)})") from error
-    home = f"{getattr(found, '__module__', None)}."
-    if not isinstance(found, type) or not home.startswith(_ALLOWED):
+    home = f"{getattr(target_class, '__module__', None)}."
+    if not isinstance(target_class, type) or not home.startswith(_ALLOWED):
         raise ValueError(
-            f"{where}: {named} leads to {type(found).__name__} of {home.rstrip('.')}; a config may name "
+            f"{where}: {named} leads to {type(target_class).__name__} of {home.rstrip('.')}; a config may name "
             f"classes of {allowed}"
         )
     for prefix, bases in _FOREIGN_BASES.items():
-        if home.startswith(prefix) and not issubclass(found, tuple(_find(prefix + base) for base in bases)):
+        if home.startswith(prefix) and not issubclass(
+            target_class, tuple(_find(prefix + base) for base in bases)
+        ):
             raise ValueError(
                 f"{where}: {named} is none of the classes that a config may name of "
                 f"{prefix.rstrip('.')}: those that inherit {' or '.join(bases)}"

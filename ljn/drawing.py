@@ -1,7 +1,7 @@
 """Drawings of clouds, skeletons and depth images, without a display."""
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import torch
@@ -34,67 +34,51 @@ def new_figure(width: float, height: float) -> "Figure":
 
 
 class Sample(NamedTuple):
-    """What is drawn of a sample; camera frame, metres.
+    """What is drawn of a sample; camera frame, metres."""
 
-    Attributes:
-        points: `(N, 3)`.
-        joints: `(24, 3)`, the truth.
-        pred_joints: `(24, 3)`.
-        title: Text above it.
-    """
-
-    points: np.ndarray
-    joints: np.ndarray
-    pred_joints: np.ndarray
-    title: str
+    points: np.ndarray  # `(N, 3)`
+    joints: np.ndarray  # `(24, 3)`, the truth
+    pred_joints: np.ndarray  # `(24, 3)`
+    title: str  # text above it
 
 
 def draw_samples(samples: list[Sample], num_columns: int) -> "Figure":
-    """A page of samples, each from the front (the camera's view) and from the side.
-
-    Args:
-        samples: What to draw, in reading order.
-        num_columns: Samples in a row.
-
-    Returns:
-        A matplotlib figure, made without a display.
-    """
+    """A page of samples in reading order, each from the front (the camera's view) and from the side."""
     num_rows = -(-len(samples) // num_columns)
-    figure = new_figure(3.8 * num_columns, 2.3 * num_rows + 0.3)
-    axes = figure.subplots(num_rows, 2 * num_columns, squeeze=False)
-    for axis in axes.flat:
-        axis.set_axis_off()
-    for number, sample in enumerate(samples):
-        row, column = divmod(number, num_columns)
-        front, side = axes[row, 2 * column], axes[row, 2 * column + 1]
+    figure, axes = _page(len(samples), num_columns, 2, 3.8 * num_columns, 2.3 * num_rows + 0.3)
+    for (front, side), sample in zip(axes, samples):
         _draw_view(front, sample, horizontal=0)
         _draw_view(side, sample, horizontal=2)
         front.set_title(sample.title, fontsize=9, loc="left")
-    figure.legend(
-        handles=[
-            axes[0, 0].plot([], [], color=_TRUE, lw=2, label="true")[0],
-            axes[0, 0].plot([], [], color=_PREDICTED, lw=2, label="predicted")[0],
-        ],
-        loc="outside lower center",
-        ncols=2,
-        fontsize=9,
-        frameon=False,
-    )
+    lines = ({"color": _TRUE, "label": "true"}, {"color": _PREDICTED, "label": "predicted"})
+    add_legend(figure, [axes[0, 0].plot([], [], lw=2, **line)[0] for line in lines])
     return figure
 
 
+def _page(
+    num_samples: int, num_columns: int, num_panels: int, width: float, height: float
+) -> tuple["Figure", np.ndarray]:
+    """An empty figure, and a sample's panels in each row of its axes `(num_rows * num_columns, num_panels)`."""
+    figure = new_figure(width, height)
+    axes = figure.subplots(-(-num_samples // num_columns), num_panels * num_columns, squeeze=False)
+    for axis in axes.flat:
+        axis.set_axis_off()
+    return figure, axes.reshape(-1, num_panels)
+
+
+def add_legend(figure: "Figure", handles: list[Any]) -> None:
+    """Name lines in one row below a figure's axes."""
+    style: dict[str, Any] = {"fontsize": 9, "frameon": False, "ncols": len(handles)}
+    figure.legend(handles=handles, loc="outside lower center", **style)
+
+
 def bone_lines(joints: np.ndarray) -> np.ndarray:
-    """The bones as one line with gaps, for one `plot`: one for each bone takes ten times as long.
+    """The bones of joints `(24, D)` as one line with gaps, for one `plot`: each by itself takes ten times as long.
 
-    Args:
-        joints: `(24, D)`.
-
-    Returns:
-        `(3 * 23, D)`: both ends of each bone, then NaN.
+    `(3 * 23, D)`: both ends of each bone, then NaN.
     """
-    return np.pad(joints[np.array(BONES)], ((0, 0), (0, 1), (0, 0)), constant_values=np.nan).reshape(
-        -1, joints.shape[-1]
-    )
+    bones = np.pad(joints[np.array(BONES)], ((0, 0), (0, 1), (0, 0)), constant_values=np.nan)
+    return bones.reshape(-1, joints.shape[-1])
 
 
 def _draw_view(axis: "Axes", sample: Sample, horizontal: int) -> None:
@@ -128,39 +112,22 @@ def clouds(batch: Mapping[str, Tensor]) -> list[np.ndarray]:
 
 
 class MeshSample(NamedTuple):
-    """What is drawn of a mesh regressor's sample; camera frame, metres.
+    """What is drawn of a mesh regressor's sample; camera frame, metres."""
 
-    Attributes:
-        points: `(N, 3)`.
-        vertices: `(V, 3)`, the truth.
-        pred_vertices: `(V, 3)`.
-        title: Text above it.
-    """
-
-    points: np.ndarray
-    vertices: np.ndarray
-    pred_vertices: np.ndarray
-    title: str
+    points: np.ndarray  # `(N, 3)`
+    vertices: np.ndarray  # `(V, 3)`, the truth
+    pred_vertices: np.ndarray  # `(V, 3)`
+    title: str  # text above it
 
 
 def draw_meshes(samples: list[MeshSample], faces: np.ndarray, num_columns: int) -> "Figure":
     """A page of samples (Fig. 3.13): predicted (red) beside true (blue) mesh, front and side, the cloud over them.
 
-    Args:
-        samples: What to draw, in reading order.
-        faces: `(F, 3)`, vertex indices.
-        num_columns: Samples in a row.
-
-    Returns:
-        A matplotlib figure.
+    All meshes have the faces `(F, 3)`.
     """
     num_rows = -(-len(samples) // num_columns)
-    figure = new_figure(6.0 * num_columns, 2.3 * num_rows)
-    axes = figure.subplots(num_rows, 4 * num_columns, squeeze=False)
-    for axis in axes.flat:
-        axis.set_axis_off()
-    for number, sample in enumerate(samples):
-        row, column = divmod(number, num_columns)
+    figure, axes = _page(len(samples), num_columns, 4, 6.0 * num_columns, 2.3 * num_rows)
+    for of_sample, sample in zip(axes, samples):
         middle = (sample.vertices.min(0) + sample.vertices.max(0)) / 2
         size_m = 1.1 * float(np.ptp(np.concatenate([sample.vertices, sample.pred_vertices]), axis=0).max())
         panels = [
@@ -171,10 +138,12 @@ def draw_meshes(samples: list[MeshSample], faces: np.ndarray, num_columns: int) 
                 (sample.vertices, (0.55, 0.68, 0.92)),
             )
         ]
-        for axis, (view, vertices, colour) in zip(axes[row, 4 * column :], panels):
-            _draw_mesh_view(axis, (vertices - middle) @ view.T, faces, size_m, colour)
-            _draw_cloud_over(axis, (sample.points - middle) @ view.T, size_m)
-        axes[row, 4 * column].set_title(sample.title, fontsize=9, loc="left")
+        camera = _panel_camera(size_m)
+        for axis, (view, vertices, colour) in zip(of_sample, panels):
+            seen = (vertices - middle) @ view.T + np.array([0, 0, _PANEL_DISTANCE_M])
+            axis.imshow(shade_mesh(seen, faces, camera, colour))
+            _draw_cloud_over(axis, (sample.points - middle) @ view.T, camera)
+        of_sample[0].set_title(sample.title, fontsize=9, loc="left")
     return figure
 
 
@@ -188,56 +157,30 @@ def _panel_camera(size_m: float) -> Camera:
     return Camera(focal, focal, centre, centre, _PANEL_PX, _PANEL_PX)
 
 
-def _draw_mesh_view(
-    axis: "Axes", vertices: np.ndarray, faces: np.ndarray, size_m: float, colour: tuple[float, float, float]
-) -> None:
-    seen = vertices + np.array([0, 0, _PANEL_DISTANCE_M])
-    axis.imshow(shade_mesh(seen, faces, _panel_camera(size_m), colour))
-
-
-def _draw_cloud_over(axis: "Axes", points: np.ndarray, size_m: float) -> None:
-    camera = _panel_camera(size_m)
+def _draw_cloud_over(axis: "Axes", points: np.ndarray, camera: Camera) -> None:
     seen = points + np.array([0, 0, _PANEL_DISTANCE_M])
-    axis.scatter(
-        camera.fx * seen[:, 0] / seen[:, 2] + camera.cx,
-        camera.fy * seen[:, 1] / seen[:, 2] + camera.cy,
-        s=0.4,
-        c="black",
-        alpha=0.25,
-        linewidths=0,
-    )
+    u, v = camera.fx * seen[:, 0] / seen[:, 2] + camera.cx, camera.fy * seen[:, 1] / seen[:, 2] + camera.cy
+    axis.scatter(u, v, s=0.4, c="black", alpha=0.25, linewidths=0)
 
 
 def draw_examples(batch: "Batch", depth: Tensor) -> "Figure":
-    """A page of training samples, two a row: depth image with keypoints, cloud with normals, initial joints.
+    """A page of B training samples, two a row: depth image with keypoints, cloud with normals, initial joints.
 
-    Args:
-        batch: B samples.
-        depth: `(B, H, W)`, metres, 0 where there is no body.
-
-    Returns:
-        A matplotlib figure. True keypoints and joints are blue, noisy and initial ones red; a point's colour
-        is its normal (x, y, z as red, green, blue).
+    `depth` is `(B, H, W)`, metres, 0 where there is no body. True keypoints and joints are blue, noisy and initial ones
+    red; a point's colour is its normal (x, y, z as red, green, blue).
     """
-    num_columns = 2
-    num_rows = -(-len(depth) // num_columns)
-    figure = new_figure(8.0 * num_columns, 3.4 * num_rows)
-    axes = figure.subplots(num_rows, 4 * num_columns, squeeze=False)
-    for axis in axes.flat:
-        axis.set_axis_off()
+    figure, axes = _page(len(depth), 2, 4, 16.0, 3.4 * -(-len(depth) // 2))
     arrays = {name: value.numpy() for name, value in batch.items()}  # type: ignore[attr-defined]
     for number, image in enumerate(depth.numpy()):
-        row, column = divmod(number, num_columns)
-        first, cloud, front, side = axes[row, 4 * column : 4 * column + 4]
+        first, cloud, front, side = axes[number]
         body = image > 0
         first.imshow(np.where(body, image, np.nan), cmap="viridis")
         first.set_axis_on()
         first.set(xticks=[], yticks=[])
         first.scatter(*arrays["true_keypoints"][number].T, s=5, c=_TRUE)
         first.scatter(*arrays["keypoints"][number].T, s=5, c=_PREDICTED)
-        first.set_title(
-            f"sample {arrays['sample_id'][number]}: {image[body].min():.2f} m away", fontsize=9, loc="left"
-        )
+        title = f"sample {arrays['sample_id'][number]}: {image[body].min():.2f} m away"
+        first.set_title(title, fontsize=9, loc="left")
         points, normals = np.split(arrays["points"][number], 2, axis=-1)
         cloud.scatter(points[:, 0], points[:, 1], s=1.5, c=(normals + 1) / 2, linewidths=0)
         cloud.set_aspect("equal")

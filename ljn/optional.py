@@ -1,40 +1,38 @@
 """Imports of optional packages, with the fix in the error when one is missing."""
 
 import os
+from importlib import import_module
 from typing import Any
 
 
-def import_open3d() -> Any:
-    """The `open3d` module.
-
-    Raises:
-        ImportError: It, or a system library that it loads, is missing; the message says what to install.
-    """
+def _import(name: str, fix: str) -> Any:
     try:
-        import open3d
-    except (ImportError, OSError) as error:
-        raise ImportError(
-            f"Open3D cannot be loaded ({error}). Install it with `pip install -e '.[open3d]'` and the system "
-            "libraries libusb-1.0-0, libegl1 and libgl1; or do without it: "
-            "data.observation.normals=knn (the same normals) or window, data.synthesis.renderer=zbuffer"
-        ) from error
-    return open3d
+        return import_module(name)
+    except (ImportError, OSError, AttributeError) as error:
+        raise ImportError(f"{name} cannot be loaded ({error}). Install it with `pip install {fix}") from error
+
+
+def import_open3d() -> Any:
+    """The `open3d` module; an `ImportError` where it, or a system library that it loads, is missing."""
+    fix = (
+        "-e '.[open3d]'` and the system libraries libusb-1.0-0, libegl1 and libgl1; or do without it: "
+        "data.observation.normals=knn (the same normals) or window, data.synthesis.renderer=zbuffer"
+    )
+    return _import("open3d", fix)
 
 
 def import_pyrender() -> Any:
-    """The `pyrender` module, set up to draw through EGL, without a display.
-
-    Raises:
-        ImportError: It, or a system library that it loads, is missing; the message says what to install.
-    """
+    """The `pyrender` module, set up to draw through EGL, without a display; an `ImportError` as `import_open3d`."""
     # pyrender reads these when it is imported; what the user has chosen stays.
     os.environ.setdefault("PYOPENGL_PLATFORM", "egl")
     os.environ.setdefault("PYGLET_HEADLESS", "true")
-    try:
-        import pyrender
-    except (ImportError, OSError, AttributeError) as error:
-        raise ImportError(
-            f"pyrender cannot be loaded ({error}). Install it with `pip install -e '.[pyrender]'` and the system "
-            "libraries libegl1, libgl1 and libxrender1; or do without it: data.synthesis.renderer=zbuffer"
-        ) from error
-    return pyrender
+    fix = (
+        "-e '.[pyrender]'` and the system libraries libegl1, libgl1 and libxrender1; or do without it: "
+        "data.synthesis.renderer=zbuffer"
+    )
+    return _import("pyrender", fix)
+
+
+def import_trimesh() -> Any:
+    """The `trimesh` module, which writes meshes; an `ImportError` where it is missing."""
+    return _import("trimesh", "trimesh`; it writes meshes")

@@ -1,4 +1,4 @@
-"""Reading files from outside: bounded in size, depth and time, and what is said of those that cannot be read."""
+"""Reading files from outside: bounded in size, depth and time; and the words for why one cannot be read."""
 
 import io
 import json
@@ -17,17 +17,10 @@ from typing import Any
 import numpy as np
 import yaml
 
-try:
-    from lzma import LZMAError
-except ImportError:  # Python can be built without it
-    _LZMA_ERRORS: tuple[type[Exception], ...] = ()
-else:
-    _LZMA_ERRORS = (LZMAError,)
-
 READ_ERRORS: tuple[type[Exception], ...] = (
     ArithmeticError, AttributeError, EOFError, LookupError, MemoryError, OSError, RuntimeError, SyntaxError, TypeError,
     ValueError, pickle.UnpicklingError, struct.error, tokenize.TokenError, yaml.YAMLError, zipfile.BadZipFile,
-    zlib.error, *_LZMA_ERRORS,
+    zlib.error,
 )  # fmt: skip
 """What the functions here, numpy, zipfile, pickle, Pillow, json and yaml raise at damaged files and at those of another
 format: each is to become a `ValueError` that names the file and gives the `reason`."""
@@ -97,16 +90,9 @@ def _text(path: Path, max_bytes: int) -> str:
 
 
 def read_arrays(path: Path, keys: Collection[str] | None = None) -> dict[str, np.ndarray]:
-    """The arrays of an `.npz` file, or the one of an `.npy` file under the key "".
+    """The arrays of an `.npz` file, or those of `keys` that it has; the one of an `.npy` file under the key "".
 
-    An archive may unpack to 256 MiB, or to 32 times its own size where that is more.
-
-    Args:
-        path: The file.
-        keys: Which arrays of an `.npz` to read, of those that there are; None reads all.
-
-    Raises:
-        Exception: One of `READ_ERRORS`.
+    An archive may unpack to 256 MiB, or to 32 times its size where that is more. Raises `READ_ERRORS`.
     """
     with path.open("rb") as file:
         if file.read(2) != b"PK":
@@ -129,14 +115,11 @@ def _check_entries(entries: Collection[zipfile.ZipInfo], max_bytes: int) -> None
 
 def _array(content: bytes) -> np.ndarray:
     """The array of an `.npy` file's content, of the size that its header says."""
-    stream = io.BytesIO(content)
-    version = np.lib.format.read_magic(stream)
-    if version == (1, 0):
-        shape, is_fortran, dtype = np.lib.format.read_array_header_1_0(stream)
-    elif version == (2, 0):
-        shape, is_fortran, dtype = np.lib.format.read_array_header_2_0(stream)
-    else:
+    stream, form = io.BytesIO(content), np.lib.format
+    if (version := form.read_magic(stream)) not in ((1, 0), (2, 0)):
         raise ValueError(f"an .npy file of version {version}")
+    read_header = form.read_array_header_1_0 if version == (1, 0) else form.read_array_header_2_0
+    shape, is_fortran, dtype = read_header(stream)
     if dtype.kind not in "biufcSU" or dtype.itemsize == 0 or min(shape, default=0) < 0:
         raise ValueError(f"it holds {brief(str(dtype))} of shape {shown(shape)}, expected numbers or text")
     start = stream.tell()
@@ -152,15 +135,14 @@ def check_archive(content: bytes) -> None:
 
     PyTorch itself passes over the checksums.
     """
-    if not content.startswith(
-        b"PK\x03\x04"
-    ):  # PyTorch would take any other beginning for a form without checksums
+    # PyTorch would take any other beginning for a form without checksums.
+    if not content.startswith(b"PK\x03\x04"):
         raise ValueError("not the archive that PyTorch writes")
     with zipfile.ZipFile(io.BytesIO(content)) as archive:
         entries = archive.infolist()
         if any(entry.compress_type != zipfile.ZIP_STORED for entry in entries):
             raise ValueError("a compressed archive, which PyTorch does not write")
-        # One bit of them calls an entry a folder: PyTorch then takes whatever stands in memory for its content.
+        # One bit of them marks an entry as a folder: PyTorch then takes uninitialised memory for its content.
         if any(entry.external_attr for entry in entries):
             raise ValueError("attributes of files, which PyTorch does not write")
         _check_entries(entries, len(content))
@@ -206,7 +188,7 @@ def check_pickle(content: bytes) -> None:
 def plain_values(content: Any) -> Iterator[Any]:
     """The single values of nested mappings and lists.
 
-    What stands in several places counts, and comes, as often: 30 lists of twice the list before are 2^30 values.
+    A value in several places is yielded, and counted, that often: 30 lists of twice the list before are 2^30 values.
 
     Raises:
         ValueError: Deeper, larger or of other types than a configuration is.
@@ -225,9 +207,7 @@ def plain_values(content: Any) -> Iterator[Any]:
             if depth >= _MAX_DEPTH or size + _SIZE_OF_VALUE * (len(pending) + len(entries)) > _MAX_SIZE:
                 raise ValueError("nested too deeply, or of too many values")
             pending += [(entry, depth + 1) for entry in entries]
-        elif (
-            value is None or type(value) in (str, bool, float) or (type(value) is int and abs(value) < 2**63)
-        ):
+        elif type(value) in (type(None), str, bool, float) or (type(value) is int and abs(value) < 2**63):
             yield value
         else:
             raise ValueError(f"a value of type {type(value).__name__}, or out of range")

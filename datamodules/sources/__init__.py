@@ -46,8 +46,7 @@ class PoseRecords:
                     f"{name}: expected shape {('R', *tail)} with R = {len(self.pose)}, got {got}"
                 )
         for name in ("pose", "betas"):
-            bad = np.flatnonzero(~np.isfinite(getattr(self, name)).all(-1))
-            if len(bad):
+            if len(bad := np.flatnonzero(~np.isfinite(getattr(self, name)).all(-1))):
                 raise ValueError(
                     f"{name}: NaN or infinite values in {len(bad)} of {len(self)} records, the first in "
                     f"record {bad[0]} (sequence '{self.sequence[bad[0]]}'); drop or repair them"
@@ -87,7 +86,7 @@ class PoseSource(Protocol):
 
     @property
     def fingerprint(self) -> str:
-        """Hash of all that its records depend on beside the seed: files, splits, settings."""
+        """Hash of all that its records depend on, except the seed: files, splits, settings."""
         ...
 
     @property

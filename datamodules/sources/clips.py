@@ -12,15 +12,10 @@ from ljn.reading import READ_ERRORS, read_arrays, read_json, reason, shown
 
 
 class Clips(NamedTuple):
-    """Frames of motion clips.
+    """Frames of motion clips."""
 
-    Attributes:
-        poses: `(N, 72)` float32 axis-angle, radians, in SMPL's axes (y up, z forward).
-        clip: `(N,)` str, each frame's clip.
-    """
-
-    poses: np.ndarray
-    clip: np.ndarray
+    poses: np.ndarray  # `(N, 72)` float32 axis-angle, radians, in SMPL's axes (y up, z forward)
+    clip: np.ndarray  # `(N,)` str, each frame's clip
 
 
 def read_clips(path: Path) -> Clips:
@@ -51,11 +46,9 @@ def read_clips(path: Path) -> Clips:
 
 
 def read_split(path: Path, clips: Clips) -> dict[str, list[str]]:
-    """The clips of each split.
+    """The clips of each split, from a JSON file.
 
-    Args:
-        path: A JSON file: for each of `SPLITS` a list of clips, or several lists under the names of their strata.
-        clips: The clips that there are.
+    It has a list of clips for each of `SPLITS`, or several lists under the names of their strata.
 
     Raises:
         FileNotFoundError: No such file.
@@ -67,9 +60,8 @@ def read_split(path: Path, clips: Clips) -> dict[str, list[str]]:
         table = read_json(path)
     except READ_ERRORS as error:
         raise ValueError(f"poses: {path} is no JSON file ({reason(error)})") from error
-    lists = (
-        {name: _joined(table[name]) for name in SPLITS if name in table} if isinstance(table, dict) else {}
-    )
+    table = table if isinstance(table, dict) else {}
+    lists = {name: _joined(table.get(name)) for name in SPLITS}
     split = {name: names for name, names in lists.items() if names is not None}
     if len(split) < len(SPLITS):
         raise ValueError(

@@ -43,7 +43,7 @@ class BodyModel:
         faces: `(F, 3)` int64, vertex indices.
         gender: A key of `GENDERS`.
         path: The file it came from; None if it was built in memory.
-        hash: 16 hex digits that name the arrays' content, whatever file format or precision held them.
+        hash: 16 hex digits that name the arrays' content, independent of file format and stored precision.
     """
 
     v_template: NDArray[np.float32] = field(repr=False)
@@ -78,16 +78,12 @@ class BodyModel:
         for name, array in (("J_regressor", self.J_regressor), ("weights", self.weights)):
             sums = array.sum(axis=1, dtype=np.float64)
             if not np.allclose(sums, 1.0, rtol=0.0, atol=1e-3):
-                raise self._error(
-                    f"the rows of {name} should each sum to 1, got sums from {sums.min():.4g} "
-                    f"to {sums.max():.4g}. {_NOT_SMPL}"
-                )
+                got = f"got sums from {sums.min():.4g} to {sums.max():.4g}"
+                raise self._error(f"the rows of {name} should each sum to 1, {got}. {_NOT_SMPL}")
         lowest, highest = self.faces.min(initial=0), self.faces.max(initial=0)
         if lowest < 0 or highest >= num_vertices:
-            raise self._error(
-                f"faces should index the {num_vertices} vertices, got indices from {lowest} "
-                f"to {highest}. {_NOT_SMPL}"
-            )
+            got = f"got indices from {lowest} to {highest}"
+            raise self._error(f"faces should index the {num_vertices} vertices, {got}. {_NOT_SMPL}")
 
     def _canonical(self, name: str, shape: tuple[int, ...]) -> NDArray[Any]:
         """The named array in the one precision and layout that is hashed: a checked, read-only copy."""
@@ -111,14 +107,11 @@ class BodyModel:
 
 
 def load_body_model(path: str | Path | None = None, gender: str = "neutral") -> BodyModel:
-    """A body model read from a file, or an embedded one.
+    """A body model read from a file, or an embedded one; checked.
 
     Args:
         path: A `.npz` or an official `.pkl` in SMPL's format; None takes the embedded body of that gender.
         gender: A key of `GENDERS`: what to take, or, since the files do not say it, what `path` holds.
-
-    Returns:
-        The checked model.
 
     Raises:
         FileNotFoundError: No such file, or no embedded body of that gender.
@@ -171,7 +164,7 @@ def load_body_models(path: str | Path | None, genders: Sequence[str]) -> tuple[B
     for gender in genders:
         _check_gender(gender)
     if path is None or not Path(path).is_dir():
-        if path is not None and Path(path).is_file() and len(genders) > 1:
+        if path and Path(path).is_file() and len(genders) > 1:
             raise ValueError(
                 f"path: the file {path} holds one body, but bodies of {', '.join(genders)} are asked for; give a "
                 "folder with a file for each, or ask for one gender (body.genders=[neutral])"
@@ -179,11 +172,8 @@ def load_body_models(path: str | Path | None, genders: Sequence[str]) -> tuple[B
         return tuple(load_body_model(path, gender) for gender in genders)
 
     def file_of(gender: str) -> Path:
-        files = [
-            file
-            for file in sorted(Path(path).iterdir())
-            if file.suffix.lower() in _READERS and _FILE_NAMES[gender].fullmatch(file.stem.lower())
-        ]
+        bodies = (file for file in sorted(Path(path).iterdir()) if file.suffix.lower() in _READERS)
+        files = [file for file in bodies if _FILE_NAMES[gender].fullmatch(file.stem.lower())]
         if not files:
             raise FileNotFoundError(
                 f"path: no body of gender {gender} in {path}; expected SMPL_{gender.upper()}.pkl, {gender}.npz or the "
@@ -199,12 +189,8 @@ def load_body_models(path: str | Path | None, genders: Sequence[str]) -> tuple[B
 
 
 def _assemble(arrays: Mapping[str, Any], gender: str, path: Path) -> BodyModel:
-    missing = [key for key in _KEYS if key not in arrays]
-    if missing:
-        raise ValueError(
-            f"{path}: should hold {', '.join(_KEYS)}; missing: {', '.join(missing)}. {_NOT_SMPL}"
-        )
-
+    if missing := ", ".join(key for key in _KEYS if key not in arrays):
+        raise ValueError(f"{path}: should hold {', '.join(_KEYS)}; missing: {missing}. {_NOT_SMPL}")
     table = arrays["kintree_table"]
     root, *parents = table[0].tolist() if table.shape == (2, NUM_JOINTS) else (None,)
     # The official root is -1 written as an unsigned number.
@@ -219,16 +205,9 @@ def _assemble(arrays: Mapping[str, Any], gender: str, path: Path) -> BodyModel:
             f"{path}: shapedirs should have shape (V, 3, {NUM_BETAS}) or more components, "
             f"got {shapedirs.shape}. {_NOT_SMPL}"
         )
-    return BodyModel(
-        v_template=arrays["v_template"],
-        shapedirs=shapedirs[:, :, :NUM_BETAS],
-        posedirs=arrays["posedirs"],
-        J_regressor=arrays["J_regressor"],
-        weights=arrays["weights"],
-        faces=arrays["f"],
-        gender=gender,
-        path=path,
-    )
+    others = {name: arrays[name] for name in ("v_template", "posedirs", "J_regressor", "weights")}
+    shapedirs = shapedirs[:, :, :NUM_BETAS]
+    return BodyModel(**others, shapedirs=shapedirs, faces=arrays["f"], gender=gender, path=path)
 
 
 def _check_gender(gender: str) -> None:
@@ -236,16 +215,11 @@ def _check_gender(gender: str) -> None:
         raise ValueError(f"gender: expected one of {', '.join(GENDERS)}, got {gender!r}")
 
 
-def _read_npz(path: Path) -> dict[str, NDArray[Any]]:
-    return read_arrays(path, _KEYS)
-
-
-def _read_pkl(path: Path) -> dict[str, NDArray[Any]]:
-    return read_pickled_arrays(path.read_bytes(), _KEYS)
-
-
 _FILE_NAMES = {
     gender: re.compile(rf"(smpl_)?{gender}|basicmodel_{official}_.*")
     for gender, official in (("female", "f"), ("male", "m"), ("neutral", "neutral"))
 }
-_READERS: dict[str, Callable[[Path], Mapping[str, Any]]] = {".npz": _read_npz, ".pkl": _read_pkl}
+_READERS: dict[str, Callable[[Path], Mapping[str, Any]]] = {
+    ".npz": lambda path: read_arrays(path, _KEYS),
+    ".pkl": lambda path: read_pickled_arrays(path.read_bytes(), _KEYS),
+}

@@ -31,12 +31,7 @@ def world_rotations(rotmat: Tensor) -> Tensor:
 
 
 def joint_positions(world: Tensor, offsets: Tensor) -> Tensor:
-    """Where the joints of posed bodies are, `(n, 24, 3)`, metres, the root at the origin.
-
-    Args:
-        world: `(n, 24, 3, 3)`; see `world_rotations`.
-        offsets: `(24, 3)`, metres; see `joint_offsets`.
-    """
+    """Where joints are, `(n, 24, 3)`, metres, root at the origin; of `world_rotations` and `joint_offsets`."""
     bones = (world[:, [max(parent, ROOT) for parent in PARENTS]] * offsets[:, None]).sum(-1)
     joints = torch.zeros_like(bones)
     for level in LEVELS[1:]:

@@ -37,9 +37,9 @@ class SMPL(nn.Module):
     """Body meshes M(beta, theta) of Eq. 3.1-3.2, differentiable, for one body or several genders at once.
 
     It computes in the precision of its buffers (`.double()` for float64), under autocast too, since half
-    precision would move vertices by millimetres (as TF32 would: leave torch's float32 matmul precision at
-    "highest"). The bodies are no part of its state dict: they may be
-    licensed, and must not travel in a checkpoint. `hash` says which they were.
+    precision would move vertices by millimetres (as TF32 would: leave torch's float32 matmul precision at "highest").
+    The bodies are no part of its state dict: they may be licensed, and must not travel in a checkpoint. `hash` says
+    which they were.
 
     Attributes:
         faces: `(F, 3)` long, vertex indices.
@@ -58,11 +58,7 @@ class SMPL(nn.Module):
     _places: Tensor
 
     def __init__(self, models: BodyModel | Sequence[BodyModel]) -> None:
-        """Builds the layer.
-
-        Args:
-            models: One body, or bodies of different genders that share their faces.
-        """
+        """Builds the layer of one body, or of bodies of different genders that share their faces."""
         super().__init__()
         models = [models] if isinstance(models, BodyModel) else list(models)
         self.genders = tuple(model.gender for model in models)
@@ -87,12 +83,7 @@ class SMPL(nn.Module):
 
     @classmethod
     def load(cls, path: str | Path | None = None, gender: str = "neutral") -> "SMPL":
-        """The layer of one model file; see `load_body_model`.
-
-        Args:
-            path: A `.npz` or `.pkl` in SMPL's format; None takes the embedded body.
-            gender: A key of `GENDERS`.
-        """
+        """The layer of one model file, or of an embedded body; see `load_body_model`."""
         return cls(load_body_model(path, gender))
 
     def on_vertices(self, vertices: Tensor) -> "SMPL":
@@ -129,16 +120,7 @@ class SMPL(nn.Module):
             return self.from_rotmats(rotvec_to_rotmat(rotvecs), betas, gender)
 
     def from_rotmats(self, rotmats: Tensor, betas: Tensor, gender: Tensor | None = None) -> SMPLOutput:
-        """Posed vertices and joints, from rotation matrices.
-
-        Args:
-            rotmats: `(..., 24, 3, 3)`, relative to the parent joint, as the vectors of `forward`'s `pose`.
-            betas: `(..., 10)`, see `forward`.
-            gender: `(...)`, see `forward`.
-
-        Returns:
-            Vertices `(..., V, 3)` and joints `(..., 24, 3)`, metres.
-        """
+        """Posed vertices and joints, from rotation matrices `(..., 24, 3, 3)` relative to the parent; see `forward`."""
         if rotmats.shape[-3:] != (NUM_JOINTS, 3, 3):
             raise ValueError(f"rotmats: expected shape (..., {NUM_JOINTS}, 3, 3), got {tuple(rotmats.shape)}")
         _check_shape("betas", betas, rotmats.shape[:-3], NUM_BETAS)
@@ -146,28 +128,16 @@ class SMPL(nn.Module):
         return SMPLOutput(vertices, joints)
 
     def rest_joints(self, betas: Tensor, gender: Tensor | None = None) -> Tensor:
-        """The joints J(beta) of the unposed body.
-
-        Args:
-            betas: `(..., 10)`.
-            gender: `(...)` long, codes of `GENDERS`; may be left out where one body is loaded.
-
-        Returns:
-            `(..., 24, 3)`, metres, SMPL's rest frame.
-        """
+        """The joints J(beta) of the unposed body, `(..., 24, 3)`, metres, SMPL's rest frame; see `forward`."""
         _check_shape("betas", betas, betas.shape[:-1], NUM_BETAS)
         (joints,) = self._by_gender(lambda slot, flat: (self._rest_joints(slot, flat),), gender, betas)
         return joints
 
     @torch.no_grad()
     def fit_betas(self, vertices: Tensor) -> Tensor:
-        """The shape whose rest mesh comes nearest to a mesh, by least squares; where one body is loaded.
+        """The shape `(..., 10)` whose rest mesh comes nearest to a mesh, by least squares; where one body is loaded.
 
-        Args:
-            vertices: `(..., V, 3)`, metres, in rest pose (T-pose, SMPL's rest frame).
-
-        Returns:
-            `(..., 10)`.
+        `vertices` are `(..., V, 3)`, metres, in rest pose (T-pose, SMPL's rest frame).
 
         Raises:
             ValueError: Several bodies are loaded, or the mesh has another number of vertices.
@@ -243,8 +213,7 @@ class SMPL(nn.Module):
     def _skin(self, slot: int, unposed: Tensor, transforms: Tensor, rest_joints: Tensor) -> Tensor:
         """W of Eq. 3.1: vertices `(B, V, 3)` moved by the weighted mean of the joints' transforms.
 
-        Coordinates come and are worked on as `(B, 3, V)`: with the vertices innermost this takes a quarter
-        of the time on a CPU.
+        Coordinates are `(B, 3, V)` throughout: with the vertices innermost this takes a quarter of the time on a CPU.
         """
         rotation, position = transforms.split([3, 1], dim=-1)
         relative = torch.cat([rotation, position - rotation @ rest_joints[..., None]], dim=-1)

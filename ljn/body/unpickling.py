@@ -1,7 +1,7 @@
 """Arrays out of a pickle without running what it names.
 
-A pickle can run any code while it is read. Here none is: whatever the file names is either a plain container or a
-class of this module that only records what it was given; arrays are decoded from those records afterwards. So
+A pickle can run any code while it is read. Here nothing is run: a name in the file becomes either a plain container or
+a class of this module that only records its arguments; arrays are decoded from those records afterwards. So
 files with chumpy arrays and sparse matrices need neither chumpy nor scipy, and a forged one does no harm.
 """
 
@@ -27,11 +27,7 @@ class ForbiddenContentError(Exception):
 
 
 def read_pickled_arrays(data: bytes, keys: Sequence[str]) -> dict[str, NDArray[Any]]:
-    """The arrays of a pickled dict, those of `keys` that it holds.
-
-    Args:
-        data: The pickle. Arrays may be numpy's, chumpy's or scipy's sparse matrices, which become dense.
-        keys: Which entries to decode.
+    """The arrays of a pickled dict, those of `keys` that it holds; scipy's sparse matrices become dense.
 
     Raises:
         ForbiddenContentError: It names something else than arrays and containers, or is not a dict of arrays.
@@ -54,6 +50,7 @@ class _Record:
     Having `__setstate__` is what keeps the unpickler from setting attributes on a record or its class.
     """
 
+    kind = "other"
     args: tuple[Any, ...]
     state: Any
 
@@ -72,40 +69,18 @@ class _Record:
         return self.state[key]
 
 
-class _Array(_Record):
-    """`numpy.ndarray`, and the `_reconstruct` that makes one."""
-
-
-class _ArrayFromBuffer(_Record):
-    """`numpy`'s `_frombuffer`: an array of pickle protocol 5."""
-
-
-class _Dtype(_Record):
-    """`numpy.dtype`."""
-
-
-class _Bytes(_Record):
-    """Python 3's bytes in a pickle of protocol 2: `_codecs.encode(text, "latin1")`, `bytes()`."""
-
-
-class _Ch(_Record):
-    """`chumpy.Ch`: an array under "x"."""
-
-
-class _Select(_Record):
-    """`chumpy.reordering.Select`: entries "idxs" of the flattened array "a"."""
-
-
-class _Compressed(_Record):
-    """`scipy.sparse`'s csr form."""
-
-
-class _CompressedColumns(_Compressed):
-    """`scipy.sparse`'s csc form."""
-
-
-class _Coordinates(_Record):
-    """`scipy.sparse`'s coo form."""
+_KINDS = {
+    kind: type(f"_{kind}", (_Record,), {"kind": kind})
+    for kind in (
+        "array",  # `numpy.ndarray`, and the `_reconstruct` that makes one
+        "buffer",  # numpy's `_frombuffer`: an array of pickle protocol 5
+        "dtype",  # `numpy.dtype`
+        "bytes",  # Python 3's bytes in a pickle of protocol 2: `_codecs.encode(text, "latin1")`, `bytes()`
+        "ch",  # `chumpy.Ch`: an array under "x"
+        "select",  # `chumpy.reordering.Select`: entries "idxs" of the flattened array "a"
+        *("csr", "csc", "coo"),  # the forms of scipy's sparse matrices
+    )
+}
 
 
 class _OrderedDict(dict):
@@ -128,16 +103,16 @@ _NAMES: dict[str, dict[str, type]] = {
     "builtins": {
         # Not the containers themselves: a call for each few bytes of the file could copy a large one.
         "object": _Record, "list": _Record, "dict": _Record, "tuple": _Record, "set": _Record, "frozenset": _Record,
-        "bytes": _Bytes, "bytearray": _Bytes,
+        "bytes": _KINDS["bytes"], "bytearray": _KINDS["bytes"],
     },
     "collections": {"OrderedDict": _OrderedDict},
     "copyreg": {"_reconstructor": _Reconstructor},
-    "_codecs": {"encode": _Bytes},
-    "numpy": {"ndarray": _Array, "dtype": _Dtype},
-    "numpy.core.multiarray": {"_reconstruct": _Array, "scalar": _Record},
-    "numpy.core.numeric": {"_frombuffer": _ArrayFromBuffer},
-    "chumpy.ch": {"Ch": _Ch},
-    "chumpy.reordering": {"Select": _Select},
+    "_codecs": {"encode": _KINDS["bytes"]},
+    "numpy": {"ndarray": _KINDS["array"], "dtype": _KINDS["dtype"]},
+    "numpy.core.multiarray": {"_reconstruct": _KINDS["array"], "scalar": _Record},
+    "numpy.core.numeric": {"_frombuffer": _KINDS["buffer"]},
+    "chumpy.ch": {"Ch": _KINDS["ch"]},
+    "chumpy.reordering": {"Select": _KINDS["select"]},
 }  # fmt: skip
 """All that a file may name, by module and name, with what stands for it."""
 
@@ -147,7 +122,6 @@ _MODULE_ALIASES = {
     "numpy._core.multiarray": "numpy.core.multiarray",
     "numpy._core.numeric": "numpy.core.numeric",
 }
-_SPARSE = {"csr": _Compressed, "csc": _CompressedColumns, "coo": _Coordinates}
 
 
 class _DataUnpickler(pickle.Unpickler):
@@ -162,7 +136,7 @@ class _DataUnpickler(pickle.Unpickler):
         if package[0] == "chumpy":
             return _Record
         if package[:2] == ("scipy", "sparse"):
-            return _SPARSE.get(name[:3], _Record)
+            return _KINDS[name[:3]] if name[:3] in ("csr", "csc", "coo") else _Record
         raise ForbiddenContentError(
             f"names {brief(f'{module}.{name}')}, which a SMPL model never needs: nothing of the file was run. "
             "It may not be a SMPL model; get it from a source you trust."
@@ -173,24 +147,29 @@ def _decode(value: Any, key: str, limit: int, level: int = 0) -> NDArray[Any]:
     """The array that a record describes; no larger than the file, which has `limit` bytes."""
     if level == _MAX_LEVELS:  # a selection from itself by itself, and so on, takes 2^levels steps
         raise ValueError(f"{key} made from arrays in more than {_MAX_LEVELS} levels")
-    if isinstance(value, _Array) and isinstance(value.state, tuple) and len(value.state) == 5:
+    kind = _kind_of(value)
+    if kind == "array" and isinstance(value.state, tuple) and len(value.state) == 5:
         _, shape, dtype, is_fortran, content = value.state
         return _decode_buffer(content, dtype, shape, "F" if is_fortran else "C")
-    if isinstance(value, _ArrayFromBuffer):
+    if kind == "buffer":
         content, dtype, shape, order = value.args[:4]
         return _decode_buffer(content, dtype, shape, order)
-    if isinstance(value, _Ch):
+    if kind == "ch":
         return _decode(value["x"], key, limit, level + 1)
-    if isinstance(value, _Select):
+    if kind == "select":
         array, indices = (_decode(value[name], key, limit, level + 1).ravel() for name in ("a", "idxs"))
         return array[indices].reshape(value["preferred_shape"])
-    if isinstance(value, _Compressed | _Coordinates):
+    if kind in ("csr", "csc", "coo"):
         return _decode_sparse(value, key, limit, level + 1)
     raise ForbiddenContentError(f"{key} should be an array, a chumpy array or a sparse matrix.")
 
 
+def _kind_of(value: Any) -> str | None:
+    return value.kind if isinstance(value, _Record) else None
+
+
 def _decode_buffer(content: Any, dtype: Any, shape: Any, order: Any) -> NDArray[Any]:
-    if not isinstance(dtype, _Dtype):
+    if _kind_of(dtype) != "dtype":
         raise ValueError("an array without its dtype")
     code = dtype.state[1] + dtype.args[0]
     if not re.fullmatch(r"[<>=|][fiub][1248]", code):
@@ -198,7 +177,7 @@ def _decode_buffer(content: Any, dtype: Any, shape: Any, order: Any) -> NDArray[
     # Any other shape is no array's: Python would multiply out strings and lists, too.
     if not (isinstance(shape, tuple) and all(isinstance(size, int) for size in shape)):
         raise ValueError("an array without its shape")
-    if isinstance(content, _Bytes):
+    if _kind_of(content) == "bytes":
         content = content.args[0] if content.args else b""
     if isinstance(content, str):
         content = content.encode("latin1")
@@ -214,7 +193,7 @@ def _decode_sparse(matrix: _Record, key: str, limit: int, level: int) -> NDArray
     if min(num_rows, num_columns) < 0 or num_rows * num_columns > limit:
         raise ValueError(f"{key} as a sparse matrix of shape {(num_rows, num_columns)}")
     values = _decode(matrix["data"], key, limit, level)
-    if isinstance(matrix, _Coordinates):
+    if matrix.kind == "coo":
         coordinates = matrix.state.get("coords") or (matrix["row"], matrix["col"])
         rows, columns = (_decode(indices, key, limit, level) for indices in coordinates)
     else:
@@ -223,7 +202,7 @@ def _decode_sparse(matrix: _Record, key: str, limit: int, level: int) -> NDArray
         if ends[-1] != len(values):
             raise ValueError(f"{key} as a sparse matrix that ends elsewhere than its values")
         rows = np.searchsorted(ends[1:], np.arange(len(values)), side="right")
-        if isinstance(matrix, _CompressedColumns):
+        if matrix.kind == "csc":
             rows, columns = columns, rows
     if min(rows.min(initial=0), columns.min(initial=0)) < 0:
         raise ValueError(f"{key} as a sparse matrix with negative indices")

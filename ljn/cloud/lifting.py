@@ -41,12 +41,12 @@ def lift_keypoints(keypoints: np.ndarray, depth: np.ndarray, camera: Camera) -> 
 def _nearest_depth(depth: np.ndarray, keypoints: np.ndarray) -> np.ndarray:
     """Depth of the body pixel nearest to each keypoint; 0 where there is none."""
     height, width = depth.shape
-    found = np.zeros(len(keypoints), np.float32)
+    borrowed = np.zeros(len(keypoints), np.float32)
     for k in range(len(keypoints)):
         u, v = keypoints[k, 0], keypoints[k, 1]
         column, row = round(u), round(v)
         if 0 <= column < width and 0 <= row < height and depth[row, column] > 0:
-            found[k] = depth[row, column]
+            borrowed[k] = depth[row, column]
             continue
         best = np.inf
         # Rows outwards from the keypoint, until none can hold a nearer pixel.
@@ -66,5 +66,5 @@ def _nearest_depth(depth: np.ndarray, keypoints: np.ndarray) -> np.ndarray:
                     distance = (row - v) ** 2 + (column - u) ** 2
                     if distance < best and depth[row, column] > 0:
                         best = distance
-                        found[k] = depth[row, column]
-    return found
+                        borrowed[k] = depth[row, column]
+    return borrowed

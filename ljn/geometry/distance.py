@@ -55,14 +55,8 @@ def _square(triangle: np.ndarray, x: float, y: float, z: float) -> float:
     s, t = bc * ac - cc * ab, bc * ab - bb * ac
     if determinant > 0.0 and s >= 0.0 and t >= 0.0 and s + t <= determinant:
         return max(aa + (s * ab + t * ac) / determinant, 0.0)
-    return max(
-        min(
-            _on_edge(aa, ab, bb),
-            _on_edge(aa, ac, cc),
-            _on_edge(aa + 2 * ab + bb, ac - ab + bc - bb, bb - 2 * bc + cc),
-        ),
-        0.0,
-    )
+    opposite = _on_edge(aa + 2 * ab + bb, ac - ab + bc - bb, bb - 2 * bc + cc)
+    return max(min(_on_edge(aa, ab, bb), _on_edge(aa, ac, cc), opposite), 0.0)
 
 
 @numba.njit(cache=True, nogil=True)

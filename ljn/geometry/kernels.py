@@ -9,13 +9,7 @@ import numpy as np
 
 @numba.njit(cache=True, nogil=True)
 def farthest_points(points: np.ndarray, centres: np.ndarray, index: np.ndarray) -> None:
-    """Write farthest point sampling of `points` `(B, N, 3)`, begun farthest from `centres` `(B, 3)`.
-
-    Args:
-        points: `(B, N, 3)`.
-        centres: `(B, 3)`.
-        index: `(B, M)`, filled.
-    """
+    """Write farthest point sampling of `points` `(B, N, 3)`, from `centres` `(B, 3)` on, into `index` `(B, M)`."""
     num_points = points.shape[1]
     distance = np.empty(num_points, points.dtype)
     for b in range(points.shape[0]):
@@ -34,13 +28,9 @@ def farthest_points(points: np.ndarray, centres: np.ndarray, index: np.ndarray) 
 
 @numba.njit(cache=True, nogil=True)
 def ball_group(points: np.ndarray, centres: np.ndarray, squared_radii: np.ndarray, index: np.ndarray) -> None:
-    """Write the first points within each ball into `index` `(B, M, n)`; an empty ball begins with -1.
+    """Write the first points `(B, N, 3)` within each ball around `(B, M, 3)` into `index` `(B, M, n)`, n at least 1.
 
-    Args:
-        points: `(B, N, 3)`.
-        centres: `(B, M, 3)`.
-        squared_radii: `(M,)`.
-        index: `(B, M, n)`, n at least 1, which is not checked; underfull balls repeat their points in turn.
+    Underfull balls repeat their points in turn; an empty ball begins with -1. There are `(M,)` squared radii.
     """
     group_size = index.shape[2]
     for b in range(points.shape[0]):

@@ -140,7 +140,7 @@ def farthest_point_sampling(points: Tensor, num_samples: int) -> Tensor:
         raise ValueError(
             f"num_samples: expected 1 to {points.shape[1]}, the number of points, got {num_samples}"
         )
-    # In float64: the mean's rounding, and with it the first point, does not hang on the points' order.
+    # In float64: the mean's rounding, and with it the first point, does not depend on the points' order.
     centres = points.double().mean(1).to(points)
     form = _farthest_points_on_cpu if points.is_cpu else _farthest_points_as_tensors
     return form(points, centres, num_samples)

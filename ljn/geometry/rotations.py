@@ -89,14 +89,9 @@ def rot6d_to_rotmat(rot6d: Tensor) -> Tensor:
 
 
 def rotation_about(axis: str, angle: Tensor) -> Tensor:
-    """Rotation matrices about a coordinate axis.
+    """Rotation matrices `(..., 3, 3)` about the "x", "y" or "z" axis.
 
-    Args:
-        axis: "x", "y" or "z".
-        angle: `(...)`, radians, counter-clockwise seen from the axis' tip.
-
-    Returns:
-        `(..., 3, 3)`.
+    `angle` is `(...)`, radians, counter-clockwise seen from the axis' tip.
     """
     if axis not in ("x", "y", "z"):
         raise ValueError(f"axis: expected 'x', 'y' or 'z', got {axis!r}")
@@ -125,9 +120,8 @@ def euler_to_rotmat(axes: str, angles: Tensor) -> Tensor:
         (j, i): ca * sc + sa * sb * cc, (j, j): ca * cc - sa * sb * sc, (j, k): -sa * cb,
         (k, i): sa * sc - ca * sb * cc, (k, j): sa * cc + ca * sb * sc, (k, k): ca * cb,
     }  # fmt: skip
-    return torch.stack([entries[row, column] for row in range(3) for column in range(3)], -1).unflatten(
-        -1, (3, 3)
-    )
+    ordered = [entries[row, column] for row in range(3) for column in range(3)]
+    return torch.stack(ordered, -1).unflatten(-1, (3, 3))
 
 
 def rotmat_to_euler(axes: str, rotmat: Tensor) -> Tensor:
@@ -174,21 +168,12 @@ def swing_twist(rotmat: Tensor, axis: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def interpolate_rotmat(start: Tensor, end: Tensor, share: Tensor) -> Tensor:
-    """Rotations on the shortest way from `start` to `end` (spherical linear interpolation).
-
-    Args:
-        start: `(..., 3, 3)` rotation matrices.
-        end: `(..., 3, 3)` rotation matrices.
-        share: `(...)`, how far to go: 0 stays at `start`, 1 reaches `end`.
-
-    Returns:
-        `(..., 3, 3)`.
-    """
+    """Rotations `(..., 3, 3)`, a share `(...)` of the shortest way from `start` to `end` (spherical interpolation)."""
     return start @ rotvec_to_rotmat(share[..., None] * rotmat_to_rotvec(start.mT @ end))
 
 
 def smpl_pose_to_body_world(pose: Tensor) -> Tensor:
-    """A pose that stands in SMPL's own axes (y up, z forward), turned into body world (z up, x forward).
+    """A pose in SMPL's axes (y up, z forward), turned into body world (z up, x forward).
 
     theta_0 <- log(R^T exp(theta_0)) with R of Eq. 3.5; the other joints are relative and stay.
 
@@ -198,25 +183,9 @@ def smpl_pose_to_body_world(pose: Tensor) -> Tensor:
     Returns:
         `(..., 72)`, mapping SMPL's rest frame into body world.
     """
-    return _turn_root(BODY_TO_OPENGL.T, pose)
-
-
-def body_world_pose_to_smpl(pose: Tensor) -> Tensor:
-    """A body-world pose turned into SMPL's own axes: the inverse of `smpl_pose_to_body_world`.
-
-    Args:
-        pose: `(..., 72)`, axis-angle, radians, mapping SMPL's rest frame into body world.
-
-    Returns:
-        `(..., 72)`, mapping SMPL's rest frame into SMPL's axes (y up, z forward).
-    """
-    return _turn_root(BODY_TO_OPENGL, pose)
-
-
-def _turn_root(rotmat: Tensor, pose: Tensor) -> Tensor:
     _check_shape("pose", pose, (72,))
     root, others = pose.split([3, 69], dim=-1)
-    return torch.cat([rotmat_to_rotvec(rotmat.to(pose) @ rotvec_to_rotmat(root)), others], dim=-1)
+    return torch.cat([rotmat_to_rotvec(BODY_TO_OPENGL.T.to(pose) @ rotvec_to_rotmat(root)), others], dim=-1)
 
 
 def _check_axes(axes: str) -> None:

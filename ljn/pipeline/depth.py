@@ -35,7 +35,7 @@ def body_depth(depth: Any, camera: Camera, mask: Any = None) -> np.ndarray:
         metres = np.where(mask != 0, metres, np.float32(0))
         if not metres.any():
             raise ValueError(
-                "mask: no pixel of the mask has a depth; is the mask black, inverted, or of another image?"
+                "mask: no pixel of the mask has a depth; is it black, inverted, or of another image?"
             )
     _check_span(metres, camera, mask is not None)
     return metres
@@ -45,12 +45,11 @@ def _check_shape(name: str, image: np.ndarray, camera: Camera) -> None:
     expected = (camera.height, camera.width)
     if image.shape == expected:
         return
+    fix = "give the camera of this image, or scale its fx, fy, cx, cy, width and height with the image"
     if image.shape == expected[::-1]:
         fix = (
             "the image is transposed, or the camera's width and height (and cx and cy, fx and fy) are swapped"
         )
-    else:
-        fix = "give the camera of this image, or scale its fx, fy, cx, cy, width and height with the image"
     raise ValueError(
         f"{name}: expected the camera's {camera.height} x {camera.width} (height x width), got "
         f"{' x '.join(map(str, image.shape))}: {fix}"
@@ -79,7 +78,7 @@ def _metres(depth: np.ndarray) -> np.ndarray:
     median = float(np.median(depth[depth > 0]))
     if is_integer and median < _NEAREST_MM:
         raise ValueError(
-            f"depth: integers are millimetres, but the median is {median:g}; metres? Give them as floats"
+            f"depth: integers are millimetres, but the median is {median:g}; metres? Give floats"
         )
     if not is_integer and median > _FARTHEST_M:
         raise ValueError(

@@ -1,7 +1,7 @@
-"""Frames one after another, from files or a camera, of which one may fail without harm to the others."""
+"""Frames one after another, from files or a camera; one that fails does not stop the others."""
 
 from collections.abc import Callable, Iterable, Iterator
-from itertools import islice, pairwise
+from itertools import count, islice, pairwise
 from pathlib import Path
 from typing import Any, Generic, NamedTuple, TypeVar
 
@@ -15,30 +15,17 @@ FrameT = TypeVar("FrameT")
 
 
 class FrameImages(NamedTuple):
-    """What is known of one image; each part as `Pipeline` takes it.
+    """What is known of one image; each part as `Pipeline` takes it."""
 
-    Attributes:
-        depth: `(H, W)`.
-        keypoints: 2D keypoints.
-        mask: `(H, W)`; None for none.
-    """
-
-    depth: Any
+    depth: Any  # `(H, W)`
     keypoints: Any
-    mask: Any = None
+    mask: Any = None  # `(H, W)`; None for none
 
 
 class FrameFiles(NamedTuple):
-    """The files of one image.
+    """The files of one image."""
 
-    Attributes:
-        name: Names its outputs.
-        depth: Depth image.
-        keypoints: Keypoints.
-        mask: Mask of the person; None for none.
-    """
-
-    name: str
+    name: str  # names its outputs
     depth: Path
     keypoints: Path
     mask: Path | None
@@ -55,19 +42,12 @@ class FrameFiles(NamedTuple):
 
 
 class FrameResult(NamedTuple, Generic[FrameT]):
-    """What became of a frame: a prediction, or an error.
-
-    Attributes:
-        frame: The frame.
-        prediction: See `Pipeline`; None after an error.
-        depth: `(H, W)`, the body's, metres; None after an error.
-        error: What was wrong with it; None otherwise.
-    """
+    """What became of a frame: a prediction, or an error."""
 
     frame: FrameT
-    prediction: Prediction | None = None
-    depth: np.ndarray | None = None
-    error: Exception | None = None
+    prediction: Prediction | None = None  # see `Pipeline`; None after an error
+    depth: np.ndarray | None = None  # `(H, W)`, the body's, metres; None after an error
+    error: Exception | None = None  # what was wrong with it; None otherwise
 
 
 def predict_frames(
@@ -77,18 +57,11 @@ def predict_frames(
     read: Callable[[FrameT], FrameImages],
     batch_size: int = 8,
 ) -> Iterator[FrameResult[FrameT]]:
-    """Predict frames, a batch at a time.
+    """Predict frames of one camera, a batch at a time; yields a result for each frame, in their order.
 
-    Args:
-        pipeline: The pipeline.
-        frames: The frames, in any form; taken as they are needed.
-        camera: The camera of all of them.
-        read: What is known of a frame. `FileNotFoundError` and `ValueError`, and the pipeline's about a frame's
-            images, become the frame's result.
-        batch_size: Frames taken before the networks run; 1 for a camera, whose next frame comes later.
-
-    Yields:
-        A result for each frame, in their order.
+    Frames have any form and are taken as they are needed; `read` gives their images. Its `FileNotFoundError` and
+    `ValueError`, and the pipeline's about a frame's images, become the frame's result. `batch_size` is 1 for a camera,
+    whose next frame comes later.
     """
     remaining = iter(frames)
     while batch := list(islice(remaining, batch_size)):
@@ -102,21 +75,15 @@ def predict_frames(
             except (ValueError, FileNotFoundError) as error:
                 results.append(FrameResult(frame, error=error))
         predictions = pipeline.predict(observations) if observations else None
-        number = 0
+        numbers = count()
         for result in results:
             if predictions is not None and result.error is None:
-                result = result._replace(prediction=predictions[number])
-                number += 1
+                result = result._replace(prediction=predictions[next(numbers)])
             yield result
 
 
 def find_frames(input: str | Path, keypoints: str | Path, mask: str | Path | None) -> list[FrameFiles]:
     """The frames of a depth image, or of a folder of them with keypoints (and masks) of the same stem in theirs.
-
-    Args:
-        input: The depth image, or the folder.
-        keypoints: Its keypoints, or their folder.
-        mask: Its mask, or their folder; None for none.
 
     Raises:
         FileNotFoundError: There is no such file or folder, or no depth image in it.
@@ -127,10 +94,8 @@ def find_frames(input: str | Path, keypoints: str | Path, mask: str | Path | Non
         if not path.exists():
             raise FileNotFoundError(f"{name}: no file or folder '{path}'")
     if len({path.is_dir() for path in paths.values()}) > 1:
-        kinds = ", ".join(
-            f"{name} is a {'folder' if path.is_dir() else 'file'}" for name, path in paths.items()
-        )
-        raise ValueError(f"input, keypoints, mask: expected files or folders alike, got: {kinds}")
+        kinds = (f"{name} is a {'folder' if path.is_dir() else 'file'}" for name, path in paths.items())
+        raise ValueError(f"input, keypoints, mask: expected files or folders alike, got: {', '.join(kinds)}")
     if not paths["input"].is_dir():
         return [FrameFiles(paths["input"].stem, paths["input"], paths["keypoints"], paths.get("mask"))]
     images = sorted(path for path in paths["input"].iterdir() if path.suffix.lower() in DEPTH_SUFFIXES)
@@ -141,12 +106,8 @@ def find_frames(input: str | Path, keypoints: str | Path, mask: str | Path | Non
             raise ValueError(
                 f"input: '{before.name}' and '{path.name}' would write the same outputs; rename one"
             )
+    masks = [paths["mask"] / f"{path.stem}.png" if mask else None for path in images]
     return [
-        FrameFiles(
-            path.stem,
-            path,
-            paths["keypoints"] / f"{path.stem}.json",
-            paths["mask"] / f"{path.stem}.png" if mask else None,
-        )
-        for path in images
+        FrameFiles(path.stem, path, paths["keypoints"] / f"{path.stem}.json", mask_path)
+        for path, mask_path in zip(images, masks)
     ]

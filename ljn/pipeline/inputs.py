@@ -15,13 +15,9 @@ _CAMERA_KEYS = ("fx", "fy", "cx", "cy", "width", "height")
 
 
 def read_depth(path: str | Path) -> np.ndarray:
-    """A depth image as it is stored: integer millimetres or floating-point metres.
+    """A depth image as it is stored: integer millimetres or floating-point metres, not yet checked (`body_depth`).
 
-    Args:
-        path: A PNG of 16 bits, a `.npy`, or a `.npz` that holds one array or one with the key `depth`.
-
-    Returns:
-        The array, unchecked; `ljn.pipeline.depth.body_depth` checks it.
+    It is a PNG of 16 bits, a `.npy`, or a `.npz` that holds one array or one with the key `depth`.
 
     Raises:
         FileNotFoundError: There is no such file.
@@ -75,22 +71,15 @@ def read_camera(path: str | Path) -> Camera:
         content = read_yaml(path)
     except READ_ERRORS as error:
         raise _unreadable("camera", path, error) from error
+    expected = f"camera: expected the keys {', '.join(_CAMERA_KEYS)} in '{path}'"
     if not isinstance(content, dict):
-        raise ValueError(
-            f"camera: expected the keys {', '.join(_CAMERA_KEYS)} in '{path}', got {shown(content)}"
-        )
+        raise ValueError(f"{expected}, got {shown(content)}")
     values = {str(key): value for key, value in content.items() if not str(key).startswith("_")}
-    for problem, names in (
-        ("are missing", [key for key in _CAMERA_KEYS if key not in values]),
-        (
-            "are unknown (there is no distortion here: undistort the images)",
-            sorted(values.keys() - set(_CAMERA_KEYS)),
-        ),
-    ):
-        if names:
-            raise ValueError(
-                f"camera: expected the keys {', '.join(_CAMERA_KEYS)} in '{path}': {brief(', '.join(names))} {problem}"
-            )
+    if missing := [key for key in _CAMERA_KEYS if key not in values]:
+        raise ValueError(f"{expected}: {', '.join(missing)} are missing")
+    if unknown := sorted(values.keys() - set(_CAMERA_KEYS)):
+        problem = "are unknown (there is no distortion here: undistort the images)"
+        raise ValueError(f"{expected}: {brief(', '.join(unknown))} {problem}")
     fx, fy, cx, cy, width, height = (_camera_number(values[key], key, path) for key in _CAMERA_KEYS)
     for key, size in (("width", width), ("height", height)):
         if not size.is_integer():
@@ -133,7 +122,7 @@ def _read_png(path: Path, name: str) -> np.ndarray:
 
     bombs: tuple[type[Exception], ...] = (Image.DecompressionBombError, Image.DecompressionBombWarning)
     try:
-        # Another format can start a program: PostScript, whatever the file's name, starts Ghostscript.
+        # Another format can start a program: PostScript, also in a file called .png, starts Ghostscript.
         with Image.open(path, formats=("PNG",)) as image:
             if image.width * image.height > MAX_PIXELS:
                 raise ValueError(f"{image.width} x {image.height} pixels, expected at most {MAX_PIXELS}")

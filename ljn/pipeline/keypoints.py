@@ -29,51 +29,21 @@ _OUTSIDE = 0.05  # how far beyond the image a keypoint may lie, of the image's l
 _AROUND = 0.1  # the same around the body's box
 
 
-class Taken(NamedTuple):
-    """Where a SMPL joint is taken from.
-
-    Attributes:
-        keypoints: Names in the order; the mean of those that are known.
-        note: What it approximates.
-    """
-
-    keypoints: tuple[str, ...]
-    note: str
-
-
 class Order(NamedTuple):
-    """A set of keypoints as detectors give it.
+    """A set of keypoints as detectors give it."""
 
-    Attributes:
-        names: Its keypoints, in order.
-        joints: For each SMPL joint that can be taken from it, from what. All other joints are filled in.
-    """
-
-    names: tuple[str, ...]
-    joints: Mapping[str, Taken]
+    names: tuple[str, ...]  # its keypoints, in order
+    # for each SMPL joint that can be taken from it, from which: the mean of those known. All others are filled in.
+    joints: Mapping[str, tuple[str, ...]]
 
 
-def _limbs(side: str, names: Mapping[str, str]) -> dict[str, Taken]:
-    """The six limb joints of a side, by their names in an order."""
-    notes = {
-        "hip": "annotated near the skin, often higher and farther out than SMPL's, which is the joint's centre",
-        "knee": "the same place",
-        "ankle": "the same place",
-        "shoulder": "the same place, roughly",
-        "elbow": "the same place",
-        "wrist": "the same place",
-    }
-    return {f"{side}_{joint}": Taken((name,), notes[joint]) for joint, name in names.items()}
-
-
+# The same places as SMPL's, but for hips, which are annotated near the skin, often higher and farther out than the
+# joint's centre. Heads, between the ears, are some 3 cm higher than SMPL's joint, where the skull turns; feet, between
+# big and small toe, some 4 cm before SMPL's, the ball of the foot.
 _LIMBS = ("hip", "knee", "ankle", "shoulder", "elbow", "wrist")
-_HEAD = "between the ears; SMPL's joint, where the skull turns, is some 3 cm lower"
-_FOOT = "between big and small toe; SMPL's joint is the ball of the foot, some 4 cm behind"
 
 ORDERS: Mapping[str, Order] = {
-    "smpl24": Order(
-        JOINT_NAMES, {name: Taken((name,), "the joint itself, projected") for name in JOINT_NAMES}
-    ),
+    "smpl24": Order(JOINT_NAMES, {name: (name,) for name in JOINT_NAMES}),
     "coco17": Order(
         (
             "nose", "left_eye", "right_eye", "left_ear", "right_ear", "left_shoulder", "right_shoulder",
@@ -81,9 +51,8 @@ ORDERS: Mapping[str, Order] = {
             "right_knee", "left_ankle", "right_ankle",
         ),
         {
-            "head": Taken(("left_ear", "right_ear"), _HEAD),
-            **_limbs("l", {joint: f"left_{joint}" for joint in _LIMBS}),
-            **_limbs("r", {joint: f"right_{joint}" for joint in _LIMBS}),
+            "head": ("left_ear", "right_ear"),
+            **{f"{side[0]}_{joint}": (f"{side}_{joint}",) for side in ("left", "right") for joint in _LIMBS},
         },
     ),
     # OpenPose's Neck and MidHip are means of its shoulders and hips, and add nothing to them.
@@ -94,11 +63,10 @@ ORDERS: Mapping[str, Order] = {
             "LHeel", "RBigToe", "RSmallToe", "RHeel",
         ),
         {
-            "head": Taken(("LEar", "REar"), _HEAD),
-            "l_foot": Taken(("LBigToe", "LSmallToe"), _FOOT),
-            "r_foot": Taken(("RBigToe", "RSmallToe"), _FOOT),
-            **_limbs("l", {joint: f"L{joint.capitalize()}" for joint in _LIMBS}),
-            **_limbs("r", {joint: f"R{joint.capitalize()}" for joint in _LIMBS}),
+            "head": ("LEar", "REar"),
+            "l_foot": ("LBigToe", "LSmallToe"),
+            "r_foot": ("RBigToe", "RSmallToe"),
+            **{f"{side.lower()}_{joint}": (f"{side}{joint.capitalize()}",) for side in "LR" for joint in _LIMBS},
         },
     ),
 }  # fmt: skip
@@ -134,8 +102,8 @@ def smpl_keypoints(keypoints: Any) -> Keypoints:
     order = ORDERS[name]
     positions, confidences = np.full((NUM_JOINTS, 2), np.nan), np.zeros(NUM_JOINTS)
     is_known = np.isfinite(table).all(1) & (table[:, 2] >= MIN_CONFIDENCE) & table[:, :2].any(1)
-    for joint, taken in order.joints.items():
-        rows = [row for row in map(order.names.index, taken.keypoints) if is_known[row]]
+    for joint, names in order.joints.items():
+        rows = [row for row in map(order.names.index, names) if is_known[row]]
         if rows:
             positions[JOINT_INDEX[joint]] = table[rows, :2].mean(0)
             confidences[JOINT_INDEX[joint]] = table[rows, 2].min()
@@ -177,13 +145,7 @@ def _weights(is_known: tuple[bool, ...]) -> np.ndarray:
 
 
 def check_place(keypoints: Keypoints, depth: np.ndarray, camera: Camera) -> None:
-    """Raise a `ValueError` unless the known keypoints lie in the image, and most of them where the body is.
-
-    Args:
-        keypoints: The keypoints.
-        depth: `(H, W)`, 0 is background.
-        camera: The camera of this image.
-    """
+    """Raise a `ValueError` unless the known keypoints lie in the image `(H, W)`, and most of them on the body."""
     is_known = keypoints.confidences > 0
     known = keypoints.positions[is_known]
     size = np.array([camera.width, camera.height])

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ljn.body.skeleton import ROOT
-from ljn.drawing import FROM_THE_SIDE, bone_lines, new_figure
+from ljn.drawing import FROM_THE_SIDE, add_legend, bone_lines, new_figure
 from ljn.geometry.camera import Camera
 from ljn.pipeline.pipeline import Prediction
 from ljn.render.shading import shade_mesh
@@ -22,15 +22,9 @@ _BESIDE = Camera(fx=400, fy=400, cx=512, cy=512, width=1024, height=1024)
 
 
 def draw_prediction(prediction: Prediction, depth: np.ndarray, camera: Camera) -> "Figure":
-    """Keypoints on the depth image, the skeleton in the cloud, and the mesh, from the front and from the side.
+    """A page of one image's prediction: keypoints on the depth, skeleton in the cloud, mesh; front and side.
 
-    Args:
-        prediction: Of one image.
-        depth: `(H, W)`, metres, 0 is background.
-        camera: The camera of this image.
-
-    Returns:
-        A matplotlib figure, made without a display.
+    `depth` is `(H, W)`, metres, 0 is background.
     """
     has_mesh = prediction.vertices is not None
     figure = new_figure(15 if has_mesh else 9, 5)
@@ -41,17 +35,12 @@ def draw_prediction(prediction: Prediction, depth: np.ndarray, camera: Camera) -
         axis.set_title(f"cloud and joints, {view}", fontsize=9, loc="left")
     if has_mesh:
         _draw_meshes(axes[3], axes[4], prediction, depth, camera)
-    figure.legend(
-        handles=[
-            axes[1].plot([], [], color=_INITIAL, lw=2, label="lifted keypoints")[0],
-            axes[1].plot([], [], color=_PREDICTED, lw=2, label="predicted joints")[0],
-            axes[1].plot([], [], color=_FILLED, lw=0, marker="o", ms=4, label="filled-in keypoints")[0],
-        ],
-        loc="outside lower center",
-        ncols=3,
-        fontsize=9,
-        frameon=False,
-    )
+    handles = [
+        axes[1].plot([], [], color=_INITIAL, lw=2, label="lifted keypoints")[0],
+        axes[1].plot([], [], color=_PREDICTED, lw=2, label="predicted joints")[0],
+        axes[1].plot([], [], color=_FILLED, lw=0, marker="o", ms=4, label="filled-in keypoints")[0],
+    ]
+    add_legend(figure, handles)
     return figure
 
 
@@ -107,10 +96,8 @@ def _draw_meshes(
     is_mesh = np.isfinite(colours[..., 0])
     body = depth[depth > 0]
     grey = np.where(depth > 0, 0.9 - 0.5 * (depth - body.min()) / max(float(np.ptp(body)), 1e-6), 1.0)
-    image = np.where(
-        is_mesh[..., None], _MESH_OPACITY * colours + (1 - _MESH_OPACITY) * grey[..., None], grey[..., None]
-    )
-    front.imshow(image)
+    over_grey = _MESH_OPACITY * colours + (1 - _MESH_OPACITY) * grey[..., None]
+    front.imshow(np.where(is_mesh[..., None], over_grey, grey[..., None]))
     _crop(front, is_mesh | (depth > 0), prediction.keypoints)
     front.set_title("mesh over the depth image", fontsize=9, loc="left")
 

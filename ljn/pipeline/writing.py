@@ -2,11 +2,11 @@
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from ljn.geometry.camera import Camera
+from ljn.optional import import_trimesh
 from ljn.pipeline.pipeline import Prediction
 
 _GLTF_FROM_CAMERA = np.array([1.0, -1.0, -1.0])
@@ -19,12 +19,9 @@ def write_arrays(path: Path, prediction: Prediction, camera: Camera) -> None:
 
 
 def write_mesh(path: Path, vertices: np.ndarray, faces: np.ndarray) -> None:
-    """Write a mesh as `.ply`, in the camera frame as the cloud, or as `.glb`, in glTF's axes: y up, z to the camera.
+    """Write a mesh as `.ply`, in the camera frame, or as `.glb`, in glTF's axes: y up, z to the camera.
 
-    Args:
-        path: Where to; its ending chooses.
-        vertices: `(V, 3)`, metres, camera frame.
-        faces: `(F, 3)`, vertex indices.
+    `vertices` are `(V, 3)`, metres, camera frame; `faces` `(F, 3)`, vertex indices.
 
     Raises:
         ImportError: trimesh is missing.
@@ -32,18 +29,3 @@ def write_mesh(path: Path, vertices: np.ndarray, faces: np.ndarray) -> None:
     if path.suffix == ".glb":
         vertices = vertices * _GLTF_FROM_CAMERA
     import_trimesh().Trimesh(vertices, faces, process=False).export(path)
-
-
-def import_trimesh() -> Any:
-    """The `trimesh` module.
-
-    Raises:
-        ImportError: It is missing; the message says what to install.
-    """
-    try:
-        import trimesh
-    except ImportError as error:
-        raise ImportError(
-            f"trimesh, which writes meshes, cannot be loaded ({error}). Install it with `pip install trimesh`"
-        ) from error
-    return trimesh

@@ -20,7 +20,7 @@ class PyRender(Renderer):
     The GL context is made on first use, in the process that uses it: a context that is older than a fork
     deadlocks in the child. One renderer a process; data workers that use it must be spawned.
 
-    Back faces are culled, whatever pyrender's flags say of it in this mode: it is for closed meshes whose faces
+    Back faces are culled, which pyrender's flags do not change in this mode: it is for closed meshes whose faces
     look outwards.
 
     Args:
@@ -53,9 +53,7 @@ class PyRender(Renderer):
             scene.add(gl_camera, pose=_GL_FROM_CAMERA)
             # SEG turns multisampling off, which would return the depth of a sample beside the pixel's centre.
             image[:] = renderer.render(
-                scene,
-                flags=flags.DEPTH_ONLY | flags.SEG,
-                seg_node_map={node: (255, 255, 255)},
+                scene, flags=flags.DEPTH_ONLY | flags.SEG, seg_node_map={node: (255, 255, 255)}
             )
         return torch.from_numpy(depth)
 

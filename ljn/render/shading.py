@@ -25,7 +25,7 @@ def shade_mesh(
         faces: `(F, 3)`, vertex indices, outwards counter-clockwise.
         camera: The camera.
         colour: RGB in 0-1, one or `(F, 3)`, one for each face.
-        background: What is seen beside the mesh: grey (NaN to find out where the mesh is), or an image `(H, W, 3)`.
+        background: Where there is no mesh: a grey value (NaN marks these pixels), or an image `(H, W, 3)`.
 
     Returns:
         `(H, W, 3)` RGB in 0-1.
@@ -36,9 +36,7 @@ def shade_mesh(
     for corner in range(3):
         np.add.at(normals, faces[:, corner], face_normals)
     seen = get_renderer("zbuffer").fragments(
-        torch.from_numpy(np.ascontiguousarray(vertices, dtype=np.float64))[None],
-        torch.tensor(faces),
-        camera,
+        torch.from_numpy(np.ascontiguousarray(vertices, dtype=np.float64))[None], torch.tensor(faces), camera
     )
     face_ids, shares = seen.face_ids[0].numpy(), seen.barycentrics[0].numpy()
     normal = (normals[faces[face_ids]] * shares[..., None]).sum(-2)

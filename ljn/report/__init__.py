@@ -15,27 +15,18 @@ __all__ = ["TABLES", "Report", "Results", "read_results", "write_report"]
 
 @dataclass(frozen=True)
 class Report:
-    """What is to be said of a sweep.
+    """A sweep's report, written and for a terminal."""
 
-    Attributes:
-        text: Its tables, for a terminal, with the failed runs by name.
-        has_failed: Whether any of its runs failed or left no result.
-        paths: The files that were written.
-    """
-
-    text: str
-    has_failed: bool
-    paths: tuple[Path, ...]
+    text: str  # its tables, for a terminal, with the failed runs by name
+    has_failed: bool  # whether any of its runs failed or left no result
+    paths: tuple[Path, ...]  # of the files that were written
 
 
 def write_report(directory: Path, is_final: bool = True) -> Report:
     """Write a sweep's tables beside its `sweep.json`: `table.csv`, `table.md`, `table.tex` and `report.html`.
 
-    Runs that failed, and files that are missing or damaged, are named as such and stop nothing.
-
-    Args:
-        directory: Holds `sweep.json`.
-        is_final: Whether the sweep has ended; before that the page is not written.
+    Runs that failed, and files that are missing or damaged, are named as such and stop nothing. Before the sweep's end
+    (`is_final`) the page is not written.
 
     Raises:
         FileNotFoundError: There is no `sweep.json`.
@@ -49,9 +40,6 @@ def write_report(directory: Path, is_final: bool = True) -> Report:
     }
     if is_final:
         contents[layout.PAGE] = to_html(results)
-    paths = []
     for name, content in contents.items():
-        path = directory / name
-        write_text_atomically(path, content)
-        paths.append(path)
-    return Report(to_text(results), bool(results.lost), tuple(paths))
+        write_text_atomically(directory / name, content)
+    return Report(to_text(results), bool(results.lost), tuple(directory / name for name in contents))

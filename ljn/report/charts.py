@@ -12,20 +12,12 @@ _LEFT, _RIGHT, _TOP, _BOTTOM = 54, 14, 14, 46
 
 @dataclass(frozen=True)
 class Series:
-    """A line.
-
-    Attributes:
-        label: What it is called.
-        points: x, y and half the length of y's error bar (None for none).
-        colour: Number of its colour.
-        is_dashed: Whether it is dashed and its markers are hollow.
-        has_markers: Whether its points are marked.
-    """
+    """A line of a chart."""
 
     label: str
-    points: tuple[tuple[float, float, float | None], ...]
+    points: tuple[tuple[float, float, float | None], ...]  # x, y, half the length of y's error bar
     colour: int = 0
-    is_dashed: bool = False
+    is_dashed: bool = False  # then its markers are hollow, too
     has_markers: bool = True
 
     @property
@@ -35,19 +27,11 @@ class Series:
 
 
 def line_chart(series: Sequence[Series], title: str, x_label: str, y_label: str) -> str:
-    """A chart with a legend, as an HTML `figure`.
-
-    Args:
-        series: The lines; those without a finite point are left out, and without any the chart is empty text.
-        title: Its caption.
-        x_label: With the unit.
-        y_label: With the unit.
-    """
+    """A chart with a legend, as an HTML `figure`; without a finite point, nothing."""
     shown = []
     for line in series:
         finite = (point for point in line.points if math.isfinite(point[0]) and math.isfinite(point[1]))
-        points = sorted(finite, key=lambda point: point[0])
-        if points:
+        if points := sorted(finite, key=lambda point: point[0]):
             shown.append((line, points))
     if not shown:
         return ""

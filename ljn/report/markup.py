@@ -31,21 +31,9 @@ def section(name: str, title: str, content: str, style: str = "") -> str:
 
 
 def table(
-    label: str,
-    head: Sequence[Sequence[str]],
-    *bodies: Sequence[str],
-    caption: str = "",
-    style: str = "",
+    label: str, head: Sequence[Sequence[str]], *bodies: Sequence[str], caption: str = "", style: str = ""
 ) -> str:
-    """A table in a box of its own, which scrolls where the page is narrow, also from the keyboard.
-
-    Args:
-        label: What the box holds.
-        head: Rows of heading cells (`th`).
-        bodies: Groups of rows (`tr`).
-        caption: What stands above it.
-        style: The table's class.
-    """
+    """A table of heading rows (of `th`) and groups of rows (`tr`), in a box that scrolls, also from the keyboard."""
     rows = "".join(f"<tr>{''.join(cells)}</tr>" for cells in head)
     groups = "".join(f"<tbody>{''.join(body)}</tbody>" for body in bodies if body)
     mark = f' class="{style}"' if style else ""

@@ -16,25 +16,14 @@ _SEED = 0
 
 @dataclass(frozen=True)
 class Cell:
-    """A number of a table, in its column's unit.
-
-    Attributes:
-        column: Its column.
-        label: Its row.
-        runs: Whose result it is, one for each seed.
-        metric: The metric that is shown; None where the row has no such value.
-        mean: Over seeds; None without a result.
-        sd: Standard deviation over seeds (one degree of freedom less); None of fewer than two.
-        num_seeds: How many there are.
-        thesis: The thesis's value.
-    """
+    """A number of a table, in its column's unit."""
 
     column: Column
-    label: str
-    runs: tuple[Run, ...]
-    metric: str | None
-    mean: float | None
-    sd: float | None
+    label: str  # of its row
+    runs: tuple[Run, ...]  # whose result it is, one for each seed
+    metric: str | None  # the metric that is shown; None where the row has no such value
+    mean: float | None  # over seeds; None without a result
+    sd: float | None  # standard deviation over seeds (one degree of freedom less); None of fewer than two
     num_seeds: int
     thesis: float | None
 
@@ -51,27 +40,17 @@ class Cell:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Two rows in one column.
-
-    Attributes:
-        column: The column.
-        better: Label of the row that the thesis's numbers, or else ours, put first.
-        worse: Label of the other one.
-        is_claim: Whether it is the thesis that puts it first.
-        is_adjacent: Whether no row of the thesis lies between the two.
-        lead: By how much the first is better in our runs, in the column's unit; negative where it is worse.
-        spread: Standard deviation of the lead over seeds; None where a row has fewer than two.
-        interval: 95 % interval of the lead over test samples, by a paired bootstrap; None where its values of the
-            same samples are not known for both.
-    """
+    """Two rows in one column."""
 
     column: Column
-    better: str
-    worse: str
-    is_claim: bool
-    is_adjacent: bool
-    lead: float
-    spread: float | None
+    better: str  # label of the row that the thesis's numbers, or else ours, put first
+    worse: str  # label of the other one
+    is_claim: bool  # whether it is the thesis that puts it first
+    is_adjacent: bool  # whether no row of the thesis lies between the two
+    lead: float  # how much better `better` is in our runs, in the column's unit; negative where it is worse
+    spread: float | None  # standard deviation of the lead over seeds; None where a row has fewer than two
+    # 95 % interval of the lead over test samples, by a paired bootstrap; None where its values of the same samples are
+    # not known for both
     interval: tuple[float, float] | None
 
     @property
@@ -81,19 +60,15 @@ class Comparison:
 
     @property
     def exceeds_spread(self) -> bool | None:
-        """Whether the lead, whatever its sign, is larger than its spread over seeds; None with single seeds."""
+        """Whether the absolute lead is larger than its spread over seeds; None with single seeds."""
         return None if self.spread is None else abs(self.lead) > self.spread
 
 
 def compare(columns: Sequence[Sequence[Cell]]) -> tuple[Comparison, ...]:
-    """The comparisons of a table.
+    """The comparisons of a table, from its columns' cells; columns without a goal are not compared.
 
-    Args:
-        columns: Its columns' cells; columns without a goal are not compared.
-
-    Returns:
-        Where the thesis has numbers, all pairs of rows that it puts in an order and that have results; where it has
-        none for any row of the table, our best row and each other one.
+    Where the thesis has numbers, all pairs of rows that it puts in an order and that have results; where it has none
+    for any row of the table, our best row and each other one.
     """
     is_claim = any(cell.thesis is not None for cells in columns for cell in cells)
     comparisons: list[Comparison] = []
@@ -105,18 +80,11 @@ def compare(columns: Sequence[Sequence[Cell]]) -> tuple[Comparison, ...]:
         for better, worse, is_adjacent in _claims(cells, sign) if is_claim else _best_and_others(cells, sign):
             if better.mean is None or worse.mean is None:
                 continue
-            comparisons.append(
-                Comparison(
-                    column=better.column,
-                    better=better.label,
-                    worse=worse.label,
-                    is_claim=is_claim,
-                    is_adjacent=is_adjacent,
-                    lead=sign * (worse.mean - better.mean),
-                    spread=None if better.sd is None or worse.sd is None else math.hypot(better.sd, worse.sd),
-                    interval=None if has_main else _interval(better, worse, sign),
-                )
-            )
+            lead = sign * (worse.mean - better.mean)
+            spread = None if better.sd is None or worse.sd is None else math.hypot(better.sd, worse.sd)
+            interval = None if has_main else _interval(better, worse, sign)
+            names = (better.column, better.label, worse.label)
+            comparisons.append(Comparison(*names, is_claim, is_adjacent, lead, spread, interval))
         has_main = True
     return tuple(comparisons)
 
@@ -127,14 +95,9 @@ def count_claims(cells: Sequence[Cell]) -> int:
 
 
 def verdict(comparisons: Sequence[Comparison], num_claims: int) -> tuple[bool | None, str]:
-    """Whether the thesis's ordering holds, in words too.
+    """Whether the thesis's ordering holds in one or more columns, in words too.
 
-    Args:
-        comparisons: Of one or more columns; see `compare`.
-        num_claims: Of these columns; see `count_claims`.
-
-    Returns:
-        None, not True, where nothing speaks against it but rows are without a result.
+    None, not True, where nothing speaks against it but rows are without a result.
     """
     claims = [comparison for comparison in comparisons if comparison.is_claim]
     if not claims:
@@ -151,16 +114,9 @@ def verdict(comparisons: Sequence[Comparison], num_claims: int) -> tuple[bool | 
 def paired_bootstrap(
     better: np.ndarray, worse: np.ndarray, num_resamples: int = NUM_RESAMPLES, seed: int = _SEED
 ) -> tuple[float, float]:
-    """The 95 % interval of the mean of `worse - better` over test samples.
+    """The 95 % interval (ends, in the metric's unit) of the mean of `worse - better` over test samples.
 
-    Args:
-        better: `(S,)`, a metric of which less is better.
-        worse: `(S,)`, of the same samples.
-        num_resamples: How often the samples are drawn anew, with replacement.
-        seed: Of the drawing.
-
-    Returns:
-        Its 2.5th and 97.5th percentile, in the metric's unit.
+    Both are `(S,)`, of the same samples, which are drawn anew `num_resamples` times, with replacement.
     """
     differences = np.asarray(worse, np.float64) - np.asarray(better, np.float64)
     generator = np.random.default_rng(seed)

@@ -15,11 +15,7 @@ _POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
 
 
 def to_html(results: Results) -> str:
-    """The page.
-
-    Args:
-        results: A sweep's tables.
-    """
+    """The page."""
     runs = results.sweep.runs
     parts = [
         *(_table_section(results, table) for table in results.tables),
@@ -81,14 +77,10 @@ def _summary(table: TableResult) -> str:
 
 def _table_section(results: Results, table: TableResult) -> str:
     notes = "".join(f"<li>{escape(note)}</li>" for note in writers.notes(results, table))
-    return markup.section(
-        table.table.name,
-        table.table.title,
-        _table(table, results.sweep.runs)
-        + _order(table)
-        + (f'<ul class="notes">{notes}</ul>' if notes else "")
-        + f'<div class="charts">{_axis_charts(table)}{_training_chart(table)}</div>',
-    )
+    notes = f'<ul class="notes">{notes}</ul>' if notes else ""
+    charts = f'<div class="charts">{_axis_charts(table)}{_training_chart(table)}</div>'
+    content = _table(table, results.sweep.runs) + _order(table) + notes + charts
+    return markup.section(table.table.name, table.table.title, content)
 
 
 def _table(table: TableResult, runs: Sequence[Run]) -> str:
@@ -99,10 +91,8 @@ def _table(table: TableResult, runs: Sequence[Run]) -> str:
     )
     rows = []
     for row, entries in zip(table.rows, page.rows):
-        links = ", ".join(
-            f'<a href="#run-{runs.index(run)}">{"run" if run.seed is None else f"seed {run.seed}"}</a>'
-            for run in row.runs
-        )
+        names = {runs.index(run): "run" if run.seed is None else f"seed {run.seed}" for run in row.runs}
+        links = ", ".join(f'<a href="#run-{number}">{name}</a>' for number, name in names.items())
         rows.append(_row(row.label, (escape(row.row.experiment or ""), links), entries))
     literature = [
         _row(entry.label, (escape(entry.source),), entries)
@@ -136,15 +126,11 @@ def _order(table: TableResult) -> str:
         badge = f'<span class="badge {holds[0]}">{holds[1]}</span>' if entry.is_claim else writers.NONE
         before = "next before" if entry.is_adjacent else "before"
         interval = " to ".join(map(_signed, entry.interval)) if entry.interval else writers.NONE
-        rows.append(
-            f'<tr><th scope="row">{escape(entry.better)} <span class="sd">{before}</span> {escape(entry.worse)}</th>'
-            + markup.cell(escape(entry.column.label), "text")
-            + markup.cell(badge, "text")
-            + markup.cell(f"{_signed(entry.lead)} {escape(writers.lead_unit(entry))}")
-            + markup.cell(writers.number(entry.spread))
-            + markup.cell(interval)
-            + "</tr>"
-        )
+        name = f'{escape(entry.better)} <span class="sd">{before}</span> {escape(entry.worse)}'
+        lead = f"{_signed(entry.lead)} {escape(writers.lead_unit(entry))}"
+        cells = [markup.cell(text, "text") for text in (escape(entry.column.label), badge)]
+        cells += map(markup.cell, (lead, writers.number(entry.spread), interval))
+        rows.append(f'<tr><th scope="row">{name}</th>{"".join(cells)}</tr>')
     head = [markup.column(name, "text") for name in ("", "metric", "thesis's order")]
     head += [markup.column(name) for name in ("lead", "spread over seeds", "95 % over samples")]
     label = f"{len(rows)} comparisons of rows" if len(rows) > 1 else "The comparison of rows"
@@ -189,9 +175,8 @@ def _training_chart(table: TableResult) -> str:
     for number, row in enumerate(table.rows):
         metric = row.row.metrics.get(shown.metric, shown.metric)
         curves = [run.curve(metric) for run in row.runs] if metric and not row.is_shared else []
-        epochs = sorted(set().union(*curves))
         points = []
-        for epoch in epochs:
+        for epoch in sorted(set().union(*curves)):
             values = [curve[epoch] for curve in curves if epoch in curve]
             points.append((float(epoch), sum(values) / len(values), None))
         if len(points) > 1:

@@ -14,25 +14,17 @@ from ljn.runs.sweep import Run, Sweep, number_of, read_sweep, varying
 
 @dataclass(frozen=True)
 class RowResult:
-    """A row of a table.
-
-    Attributes:
-        row: What was asked for.
-        label: What it is called, with what tells it from other runs of its experiment.
-        runs: One for each seed.
-        cells: One for each column.
-        x: Its place on the table's axis: the value that its runs were configured with.
-    """
+    """A row of a table."""
 
     row: Row
-    label: str
-    runs: tuple[Run, ...]
-    cells: tuple[Cell, ...]
-    x: float | None
+    label: str  # what it is called, with what tells it from other runs of its experiment
+    runs: tuple[Run, ...]  # one for each seed
+    cells: tuple[Cell, ...]  # one for each column
+    x: float | None  # its place on the table's axis: the value that its runs were configured with
 
     @property
     def is_shared(self) -> bool:
-        """Whether it shows what all runs share, from any of them."""
+        """Whether it shows a value that all runs share, from any of them."""
         return self.row.experiment is None and self.row.overrides is None
 
     @property
@@ -55,58 +47,41 @@ class RowResult:
 
 @dataclass(frozen=True)
 class TableResult:
-    """A table with results.
-
-    Attributes:
-        table: What was asked for.
-        rows: Its rows.
-        comparisons: Between its rows: those that the thesis's numbers claim, or else the best row and the others.
-        num_claims: Of each column, how many pairs of rows the thesis puts in an order, with results or without.
-    """
+    """A table with results."""
 
     table: Table
     rows: tuple[RowResult, ...]
+    # between its rows: those that the thesis's numbers claim, or else the best row and the others
     comparisons: tuple[Comparison, ...]
+    # of each column, how many pairs of rows the thesis puts in an order, with results or without
     num_claims: tuple[int, ...]
 
     @property
     def has_thesis(self) -> tuple[bool, ...]:
         """Of each column, whether any row has a number of the thesis."""
-        return tuple(
-            any(row.cells[number].thesis is not None for row in self.rows)
-            for number in range(len(self.table.columns))
-        )
+        columns = range(len(self.table.columns))
+        return tuple(any(row.cells[number].thesis is not None for row in self.rows) for number in columns)
 
 
 @dataclass(frozen=True)
 class Results:
-    """A sweep's tables.
-
-    Attributes:
-        sweep: The sweep.
-        tables: Its tables; runs that belong to none of those asked for have one of their own.
-    """
+    """A sweep's tables."""
 
     sweep: Sweep
-    tables: tuple[TableResult, ...]
+    tables: tuple[TableResult, ...]  # runs that belong to none of those asked for have a table for themselves
 
     @property
     def lost(self) -> tuple[Run, ...]:
         """The runs that failed, then those that left no result although nothing says that they failed."""
-        return tuple(
-            run for status in ("failed", "missing") for run in self.sweep.runs if run.status == status
-        )
+        return tuple(run for kind in ("failed", "missing") for run in self.sweep.runs if run.status == kind)
 
 
 def read_results(directory: Path) -> Results:
-    """The tables of a sweep.
-
-    Args:
-        directory: Holds `sweep.json`.
+    """The tables of a sweep, from the directory that holds its `sweep.json`.
 
     Raises:
-        FileNotFoundError: It does not.
-        ValueError: That file is damaged, or names a table that there is not.
+        FileNotFoundError: There is no such file.
+        ValueError: It is damaged, or names a table that there is not.
     """
     sweep = read_sweep(directory)
     unknown = [name for name in sweep.tables if name not in TABLES]
@@ -122,13 +97,7 @@ def read_results(directory: Path) -> Results:
 
 
 def grids(name: str, title: str, runs: Sequence[Run]) -> list[Table]:
-    """Tables of any runs: a row for each setting, a table for each stage, whose metrics are its own.
-
-    Args:
-        name: The table's name.
-        title: Its title.
-        runs: What is shown.
-    """
+    """Tables of any runs: a row for each setting, a table for each stage, whose metrics are its own."""
     settings: dict[Any, list[Run]] = {}
     for run in runs:
         settings.setdefault((run.experiment, run.overrides), []).append(run)
@@ -215,18 +184,10 @@ def _result(row: Row, label: str, runs: Sequence[Run], table: Table) -> RowResul
     for column in table.columns:
         metric = row.metrics.get(column.metric, column.metric)
         values = [run.metrics[metric] for run in runs if metric is not None and metric in run.metrics]
-        cells.append(
-            Cell(
-                column=column,
-                label=label,
-                runs=tuple(runs),
-                metric=metric,
-                mean=math.fsum(values) / len(values) if values else None,
-                sd=statistics.stdev(values) if len(values) > 1 and all(map(math.isfinite, values)) else None,
-                num_seeds=len(values),
-                thesis=row.thesis.get(column.metric),
-            )
-        )
+        mean = math.fsum(values) / len(values) if values else None
+        sd = statistics.stdev(values) if len(values) > 1 and all(map(math.isfinite, values)) else None
+        thesis = row.thesis.get(column.metric)
+        cells.append(Cell(column, label, tuple(runs), metric, mean, sd, len(values), thesis))
     x = row.x
     if table.axis is not None and row.x is not None:
         configured = (run.setting(table.axis.key) for run in runs)

@@ -68,9 +68,8 @@ def _counts(runs: Sequence[Run]) -> str:
         f"{cell(mono(pool[split]) if pool.get(split) else NONE, 'text')}</tr>"
         for split, row in cells.items()
     ]
-    return table(
-        "Numbers of data", (groups, columns), rows, caption=f"{len(runs)} run{'s' * (len(runs) > 1)}"
-    )
+    caption = f"{len(runs)} run{'s' * (len(runs) > 1)}"
+    return table("Numbers of data", (groups, columns), rows, caption=caption)
 
 
 def _cell(value: Any, style: str) -> str:
@@ -125,6 +124,9 @@ def provenance(runs: Sequence[Run]) -> str:
     rows = []
     for number, run in enumerate(runs):
         record = run.record
+        bodies = mapping(run.data.get("bodies")).items()
+        versions = mapping(record.get("versions")).items()
+        parameters = record.get("num_parameters")
         cells = (
             text(run.seed),
             text(run.status) if run.status == "complete" else f'<span class="word">{run.status}</span>',
@@ -132,20 +134,13 @@ def provenance(runs: Sequence[Run]) -> str:
             mono(record.get("config_hash")),
             _commit(record),
             _data(run),
-            "<br>".join(
-                f"{escape(str(name))} {mono(value)}"
-                for name, value in mapping(run.data.get("bodies")).items()
-            )
-            or MISSING,
+            "<br>".join(f"{escape(str(name))} {mono(value)}" for name, value in bodies) or MISSING,
             mono(" ".join(run.overrides)) if run.overrides else "none",
-            _count(record.get("num_parameters"))
-            if record.get("num_parameters") is not None
-            else _trained_by(record),
+            _trained_by(record) if parameters is None else _count(parameters),
             _duration(record.get("wall_time_s")),
             text(record.get("device")),
             text(record.get("started")),
-            escape(", ".join(f"{key} {value}" for key, value in mapping(record.get("versions")).items()))
-            or MISSING,
+            text(", ".join(f"{key} {value}" for key, value in versions)),
         )
         body = "".join(cell(value, "text") for value in cells)
         sub = f'<span class="sub">{escape(run.experiment)}</span>' if run.experiment else ""
@@ -160,9 +155,10 @@ def _commit(record: Mapping[str, Any]) -> str:
     if not commit:
         return MISSING
     is_dirty = record.get("is_dirty")
-    return mono(str(commit)[:10]) + (
-        ", with changes" if is_dirty is True else ", clean" if is_dirty is False else ""
+    suffix = (
+        {True: ", with changes", False: ", clean"}.get(is_dirty, "") if isinstance(is_dirty, bool) else ""
     )
+    return mono(str(commit)[:10]) + suffix
 
 
 def _data(run: Run) -> str:

@@ -12,18 +12,12 @@ Values = Mapping[str, float | None]
 
 @dataclass(frozen=True)
 class Column:
-    """A column of a table.
+    """A column of a table."""
 
-    Attributes:
-        metric: Key in `metrics.json`, without `test/`.
-        label: What it is called.
-        unit: Its unit.
-        goal: Which values are better; None for what describes the input, where none is.
-    """
-
-    metric: str
+    metric: str  # key in `metrics.json`, without `test/`
     label: str
     unit: str
+    # which values are better; None for what describes the input, where none is
     goal: Literal["min", "max"] | None = None
 
     @property
@@ -34,73 +28,44 @@ class Column:
 
 @dataclass(frozen=True)
 class Axis:
-    """What a table varies, for its curves.
+    """What a table varies, for its curves."""
 
-    Attributes:
-        label: With its unit.
-        key: Where a run's configuration has the value, such as `data.observation.num_points`.
-    """
-
-    label: str
-    key: str
+    label: str  # with its unit
+    key: str  # where a run's configuration has the value, such as `data.observation.num_points`
 
 
 @dataclass(frozen=True)
 class Row:
-    """A row of a table.
-
-    Attributes:
-        label: What it is called.
-        experiment: Whose runs it shows; None for any finished run (what all of them share).
-        thesis: The thesis's values by column.
-        x: The thesis's place on the table's axis.
-        metrics: Columns where another metric of the run is shown; None: the row has no such value.
-        overrides: If given, only runs with exactly these.
-    """
+    """A row of a table."""
 
     label: str
-    experiment: str | None
-    thesis: Values = field(default_factory=dict)
-    x: float | None = None
+    experiment: str | None  # whose runs it shows; None for any finished run (what all of them share)
+    thesis: Values = field(default_factory=dict)  # by column
+    x: float | None = None  # the thesis's place on the table's axis
+    # columns where another metric of the run is shown; None: the row has no such value
     metrics: Mapping[str, str | None] = field(default_factory=dict)
-    overrides: tuple[str, ...] | None = None
+    overrides: tuple[str, ...] | None = None  # if given, only runs with exactly these
 
 
 @dataclass(frozen=True)
 class Literature:
-    """A row of other people's results.
+    """A row of other people's results."""
 
-    Attributes:
-        label: The method.
-        values: By column.
-        source: Where the numbers come from.
-    """
-
-    label: str
-    values: Values
-    source: str
+    label: str  # the method
+    values: Values  # by column
+    source: str  # where the numbers come from
 
 
 @dataclass(frozen=True)
 class Table:
-    """A table.
+    """A table."""
 
-    Attributes:
-        name: Its key, such as `table_3_2`.
-        title: What it shows.
-        columns: The metrics.
-        rows: The experiments, in the thesis's order.
-        literature: Rows of other people's results.
-        axis: What is varied, where that is a number.
-        notes: Footnotes.
-    """
-
-    name: str
+    name: str  # its key, such as `table_3_2`
     title: str
     columns: tuple[Column, ...]
-    rows: tuple[Row, ...]
+    rows: tuple[Row, ...]  # in the thesis's order
     literature: tuple[Literature, ...] = ()
-    axis: Axis | None = None
+    axis: Axis | None = None  # what is varied, where that is a number
     notes: tuple[str, ...] = ()
 
 
@@ -122,12 +87,8 @@ ROOT_ALIGNED_NOTE = (
     "† Joints that only mean something beside the root, such as the simple baseline's: MPJPE and PCKh after the roots "
     "were moved to the same place (test/mpjpe_root_aligned, test/pckh_root_aligned)."
 )
-ROOT_ALIGNED = {
-    "mpjpe": "mpjpe_root_aligned",
-    "mpjpe_eq38": "mpjpe_root_aligned",
-    "pckh": "pckh_root_aligned",
-}
-"""What rows of detectors show whose joints only mean something beside the root."""
+ROOT_ALIGNED = dict.fromkeys(("mpjpe", "mpjpe_eq38"), "mpjpe_root_aligned") | {"pckh": "pckh_root_aligned"}
+"""The metrics of rows of detectors whose joints are only defined relative to the root."""
 _NO_PCKH = {"mpjpe": "initial_mpjpe", "pckh": None}
 
 _NOISE_2D = Axis("σ of the 2D joints' noise, px", "data.synthesis.keypoint_noise_px")
@@ -145,6 +106,10 @@ def _values(columns: Sequence[Column], *values: float | None) -> dict[str, float
     return {column.metric: value for column, value in zip(columns, values)}
 
 
+def _simple_baseline(label: str, experiment: str, mpjpe: float, pckh: float) -> Row:
+    return Row(label, experiment, _values(_DETECTOR, mpjpe, pckh), metrics=ROOT_ALIGNED)
+
+
 _DETECTOR_PROPOSED = _values(_DETECTOR_NOISE, 53.2, 12.5, 24.2, 90.8)
 _MESH_PROPOSED = _values(_MESH_NOISE, 105.6, 25.1, 34.5, 33.0)
 _MESH_CHAIN = _values(_MESH_NOISE, None, None, 38.8, 36.8)
@@ -160,18 +125,8 @@ _ALL = (
             Row("basic", "detector/basic", _values(_DETECTOR, 32.1, 85.6)),
             Row("proposed without EDM", "detector/no_edm", _values(_DETECTOR, 25.0, 90.2)),
             Row("proposed", "detector/proposed", _values(_DETECTOR, 24.2, 90.8)),
-            Row(
-                "simple baseline, σ = 0",
-                "detector/simple_baseline_0px",
-                _values(_DETECTOR, 59.4, 51.9),
-                metrics=ROOT_ALIGNED,
-            ),
-            Row(
-                "simple baseline, σ = 10 px",
-                "detector/simple_baseline",
-                _values(_DETECTOR, 81.3, 33.6),
-                metrics=ROOT_ALIGNED,
-            ),
+            _simple_baseline("simple baseline, σ = 0", "detector/simple_baseline_0px", 59.4, 51.9),
+            _simple_baseline("simple baseline, σ = 10 px", "detector/simple_baseline", 81.3, 33.6),
         ),
         notes=(
             "All but the fourth row have 2D joints with noise of σ = 10 px.",
@@ -300,13 +255,7 @@ TABLES: dict[str, Table] = {table.name: table for table in _ALL}
 """The tables by name: the thesis's, their cross evaluations and the demonstration's."""
 
 NUM_DATA: Mapping[str, Mapping[str, int]] = {
-    "train": {
-        "subjects": 115,
-        "sequences": 1_964,
-        "clips": 55_001,
-        "frames": 5_342_090,
-        "samples": 60_000,
-    },
+    "train": {"subjects": 115, "sequences": 1_964, "clips": 55_001, "frames": 5_342_090, "samples": 60_000},
     "val": {"samples": 5_000},
     "test": {"subjects": 30, "sequences": 703, "clips": 12_528, "frames": 1_194_662, "samples": 15_000},
 }

@@ -93,30 +93,20 @@ def sources_of(runs: Iterable[Run]) -> list[str]:
 
 
 class Entry(NamedTuple):
-    """A cell of a table as text.
+    """A cell of a table as text."""
 
-    Attributes:
-        text: What it says; never nothing.
-        style: Its class on the page: `thesis`, `ours`, `none` (a dash) or `word`; none of these for another number.
-    """
-
-    text: str
+    text: str  # what it says; never nothing
+    # its class on the page: `thesis`, `ours`, `none` (a dash) or `word`; none of these for another number
     style: str = ""
 
 
 @dataclass(frozen=True)
 class Sheet:
-    """A table's cells as text: what the plain, Markdown, LaTeX and HTML tables have in common.
+    """A table's cells as text: what the plain, Markdown, LaTeX and HTML tables have in common."""
 
-    Attributes:
-        groups: A heading and how many columns it spans, for each of the table's columns.
-        columns: Second headings, one a column.
-        rows: Cells, the row's label first; literature follows our own rows.
-    """
-
-    groups: list[tuple[str, int]]
-    columns: list[str]
-    rows: list[list[Entry]]
+    groups: list[tuple[str, int]]  # a heading and how many columns it spans, for each of the table's columns
+    columns: list[str]  # second headings, one a column
+    rows: list[list[Entry]]  # cells, the row's label first; literature follows our own rows
 
     @property
     def texts(self) -> list[list[str]]:
@@ -126,10 +116,9 @@ class Sheet:
 
 def sheet(table: TableResult) -> Sheet:
     """A table as text."""
-    names = [
-        headings(column, has_thesis) for column, has_thesis in zip(table.table.columns, table.has_thesis)
-    ]
-    groups = [(column.heading, len(below)) for column, below in zip(table.table.columns, names)]
+    shown = table.table.columns
+    names = [headings(column, has_thesis) for column, has_thesis in zip(shown, table.has_thesis)]
+    groups = [(column.heading, len(below)) for column, below in zip(shown, names)]
     none = Entry(NONE, "none")
     rows = []
     for row in table.rows:
@@ -144,7 +133,7 @@ def sheet(table: TableResult) -> Sheet:
         rows.append([*entries, _seeds(row) if any(cell.metric for cell in row.cells) else none])
     for literature in table.table.literature:
         entries = [Entry(f"{literature.label} ({literature.source})")]
-        for column, below in zip(table.table.columns, names):
+        for column, below in zip(shown, names):
             value = Entry(number(literature.values.get(column.metric)), "thesis")
             entries += [value if name == "thesis" else none for name in below]
         rows.append([*entries, none])
@@ -153,7 +142,7 @@ def sheet(table: TableResult) -> Sheet:
 
 
 def _ours(row: RowResult, cell: Cell) -> Entry:
-    """Our value with its standard deviation over seeds; `failed` or `missing` where there is none, never nothing."""
+    """Our value with its standard deviation over seeds; `failed` or `missing` where there is none."""
     if cell.metric is None:
         return Entry(NONE, "none")
     if cell.mean is None:
@@ -177,9 +166,7 @@ def to_text(results: Results) -> str:
 
 def _text_table(results: Results, table: TableResult) -> str:
     page = sheet(table)
-    widths = [
-        max(len(line[index]) for line in [page.columns, *page.texts]) for index in range(len(page.columns))
-    ]
+    widths = [max(map(len, column)) for column in zip(page.columns, *page.texts)]
     start = 0
     heading = []
     for name, span in page.groups:
@@ -191,54 +178,33 @@ def _text_table(results: Results, table: TableResult) -> str:
         start += span
 
     def line(texts: Sequence[str]) -> str:
-        cells = [
-            text.ljust(width) if not index else text.rjust(width)
-            for index, (text, width) in enumerate(zip(texts, widths))
-        ]
-        return "  ".join(cells).rstrip()
+        numbers = (text.rjust(width) for text, width in zip(texts[1:], widths[1:]))
+        return "  ".join([texts[0].ljust(widths[0]), *numbers]).rstrip()
 
-    order = describe_order(table)
-    return "\n".join(
-        [
-            f"{table.table.title} (preset {results.sweep.preset})",
-            "  ".join(heading).rstrip(),
-            *map(line, [page.columns, *page.texts]),
-            *([order] if order else []),
-        ]
-    )
+    title = f"{table.table.title} (preset {results.sweep.preset})"
+    lines = [
+        title,
+        "  ".join(heading).rstrip(),
+        *map(line, [page.columns, *page.texts]),
+        describe_order(table),
+    ]
+    return "\n".join(lines).removesuffix("\n")
 
 
 def to_csv(results: Results) -> str:
     """Every number of every table, one a line: unrounded, empty where there is none."""
     buffer = io.StringIO()
-    writer = csv.DictWriter(buffer, CSV_FIELDS, lineterminator="\n")
-    writer.writeheader()
+    writer = csv.writer(buffer, lineterminator="\n")
+    writer.writerow(CSV_FIELDS)
     for table in results.tables:
         for row in table.rows:
+            overrides = " ".join(row.runs[0].overrides) if row.runs else None
+            directories = ("/".join(run.directory.parts[-2:]) for run in row.runs if run.directory)
+            run_dirs = ";".join(directories)
             for cell in row.cells:
-                writer.writerow(
-                    {
-                        "table": table.table.name,
-                        "row": row.label,
-                        "experiment": row.row.experiment,
-                        "overrides": " ".join(row.runs[0].overrides) if row.runs else None,
-                        "x": row.x,
-                        "column": cell.column.label,
-                        "metric": cell.metric,
-                        "unit": cell.column.unit,
-                        "mean": cell.mean,
-                        "sd": cell.sd,
-                        "num_seeds": cell.num_seeds,
-                        "thesis": cell.thesis,
-                        "difference": cell.difference,
-                        "status": row.status,
-                        "run_dirs": ";".join(
-                            f"{run.directory.parent.name}/{run.directory.name}"
-                            for run in row.runs
-                            if run.directory
-                        ),
-                    }
-                )
+                shown = (cell.column.label, cell.metric, cell.column.unit, cell.mean, cell.sd, cell.num_seeds)
+                of_row = (table.table.name, row.label, row.row.experiment, overrides, row.x)
+                writer.writerow([*of_row, *shown, cell.thesis, cell.difference, row.status, run_dirs])
     return buffer.getvalue()
 
 
@@ -284,50 +250,35 @@ def _latex_table(results: Results, table: TableResult) -> str:
         body.insert(len(table.rows), r"    \midrule")
     failed = [describe_job(run) for row in table.rows for run in row.runs if run.status != "complete"]
     remarks = [text for text in (describe_order(table), *notes(results, table), *failed) if text]
-    return "\n".join(
-        [
-            "% needs \\usepackage{booktabs}",
-            r"\begin{table}",
-            r"  \centering",
-            f"  \\caption{{{latex(table.table.title)} (preset {latex(results.sweep.preset)}).}}",
-            f"  \\label{{tab:{re.sub(r'[^A-Za-z0-9]+', '-', table.table.name)}}}",
-            f"  \\begin{{tabular}}{{l{'r' * (len(page.columns) - 1)}}}",
-            r"    \toprule",
-            line(headings, str),
-            "    " + "".join(rules),
-            line(page.columns),
-            r"    \midrule",
-            *body,
-            r"    \bottomrule",
-            r"  \end{tabular}",
-            *(f"  \\par\\smallskip\\footnotesize {latex(remark)}" for remark in remarks),
-            r"\end{table}",
-            "",
-        ]
-    )
+    lines = [
+        "% needs \\usepackage{booktabs}",
+        r"\begin{table}",
+        r"  \centering",
+        f"  \\caption{{{latex(table.table.title)} (preset {latex(results.sweep.preset)}).}}",
+        f"  \\label{{tab:{re.sub(r'[^A-Za-z0-9]+', '-', table.table.name)}}}",
+        f"  \\begin{{tabular}}{{l{'r' * (len(page.columns) - 1)}}}",
+        r"    \toprule",
+        *(line(headings, str), "    " + "".join(rules), line(page.columns)),
+        r"    \midrule",
+        *body,
+        r"    \bottomrule",
+        r"  \end{tabular}",
+        *(f"  \\par\\smallskip\\footnotesize {latex(remark)}" for remark in remarks),
+        r"\end{table}",
+    ]
+    return "\n".join(lines) + "\n"
 
 
-_LATEX = {
-    "\\": r"\textbackslash{}",
-    "~": r"\textasciitilde{}",
-    "^": r"\textasciicircum{}",
-    "<": r"\textless{}",
-    ">": r"\textgreater{}",
-    "|": r"\textbar{}",
-    '"': r"\textquotedbl{}",
-    "σ": r"$\sigma$",
-    "±": r"$\pm$",
-    "–": "--",
-    "†": r"$\dagger$",
-    "\n": " ",
-    **{character: f"\\{character}" for character in "&%$#_{}"},
-}
+_LATEX = str.maketrans({
+    "\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "<": r"\textless{}",
+    ">": r"\textgreater{}", "|": r"\textbar{}", '"': r"\textquotedbl{}", "σ": r"$\sigma$", "±": r"$\pm$",
+    "–": "--", "†": r"$\dagger$", "\n": " ", **{character: f"\\{character}" for character in "&%$#_{}"},
+})  # fmt: skip
 
 
 def latex(text: str) -> str:
     """Text with what LaTeX would take for commands escaped; a number's sign becomes a minus."""
-    escaped = "".join(_LATEX.get(character, character) for character in text)
-    return re.sub(r"^-(?=\d)", "$-$", escaped)
+    return re.sub(r"^-(?=\d)", "$-$", text.translate(_LATEX))
 
 
 def _markdown(text: str) -> str:

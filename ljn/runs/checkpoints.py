@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from lightning.pytorch import Callback, LightningModule, Trainer
+from lightning.pytorch import Callback
 from lightning.pytorch.plugins.io import TorchCheckpointIO
 from torch import Tensor
 from torch.nn.modules.module import register_module_parameter_registration_hook
@@ -33,19 +33,11 @@ _DTYPES = (
 
 
 class Provenance(Callback):
-    """Adds to every checkpoint what is needed to use it alone.
-
-    Args:
-        config: The resolved configuration, plain values.
-        body_hash: Hashes of the bodies of data and model, joined by "-"; empty without bodies.
-        data_licence: What is to be said of the data's licence.
-        run: Name of the run's directory.
-        recipe: How the observations that it was trained on were made; None where there were none.
-    """
+    """Adds to every checkpoint what is needed to use it alone; see `Checkpoint`."""
 
     def __init__(
         self,
-        config: Mapping[str, Any],
+        config: dict[str, Any],
         body_hash: str,
         data_licence: str,
         run: str,
@@ -53,16 +45,14 @@ class Provenance(Callback):
     ) -> None:
         self.content = {
             "version": CHECKPOINT_VERSION,
-            "config": dict(config),
+            "config": config,
             "body_hash": body_hash,
             "data_licence": data_licence,
             "run": run,
             "observation": None if recipe is None else asdict(recipe),
         }
 
-    def on_save_checkpoint(
-        self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]
-    ) -> None:
+    def on_save_checkpoint(self, trainer: Any, pl_module: Any, checkpoint: dict[str, Any]) -> None:
         """Add the content under its key."""
         checkpoint[_PROVENANCE_KEY] = self.content
 
@@ -89,29 +79,18 @@ class AtomicCheckpointIO(TorchCheckpointIO):
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """A checkpoint of this library.
+    """A checkpoint of this library."""
 
-    Attributes:
-        path: The file.
-        config: The resolved configuration that the model was trained with.
-        body_hash: Hashes of the bodies that its data showed, joined by "-".
-        data_licence: What is said of the data's licence.
-        run: Name of the directory of the training run.
-        epoch: Epochs completed when it was written.
-        recipe: How the observations that it was trained on were made; None where there were none.
-        state: The module's state dict.
-        file_hash: First 16 hex digits of the file's SHA-256.
-    """
-
-    path: Path
-    config: dict[str, Any]
-    body_hash: str
-    data_licence: str
-    run: str
-    epoch: int
+    path: Path  # the file
+    config: dict[str, Any]  # the resolved configuration that the model was trained with
+    body_hash: str  # hashes of the bodies that its data showed, joined by "-"
+    data_licence: str  # one line on the data's licence
+    run: str  # name of the directory of the training run
+    epoch: int  # epochs completed when it was written
+    # how the observations that it was trained on were made; None where there were none
     recipe: ObservationRecipe | None
-    state: dict[str, Tensor]
-    file_hash: str
+    state: dict[str, Tensor]  # the module's state dict
+    file_hash: str  # first 16 hex digits of the file's SHA-256
 
     def unknown_bodies(self, hashes: Iterable[str]) -> list[str]:
         """Those of the bodies' hashes that it was not trained with: a model is only meaningful with its bodies."""
@@ -119,11 +98,7 @@ class Checkpoint:
 
 
 def read_checkpoint(path: str | Path, name: str = "ckpt_path") -> Checkpoint:
-    """Read a checkpoint.
-
-    Args:
-        path: The file.
-        name: The argument to name in errors.
+    """Read a checkpoint; errors call its argument `name`.
 
     Raises:
         FileNotFoundError: There is no such file.
@@ -150,28 +125,23 @@ def read_checkpoint(path: str | Path, name: str = "ckpt_path") -> Checkpoint:
             "carries no whole configuration"
         )
     if provenance["version"] != CHECKPOINT_VERSION:
-        newer = provenance["version"] > CHECKPOINT_VERSION
+        age, fix = "an older", "train it again, or evaluate it with the version it is from"
+        if provenance["version"] > CHECKPOINT_VERSION:
+            age, fix = "a newer", "update the library"
         raise ValueError(
-            f"{name}: '{path}' was written by {'a newer' if newer else 'an older'} version of this library "
-            f"(checkpoint version {provenance['version']}, this one reads {CHECKPOINT_VERSION}); "
-            + (
-                "update the library"
-                if newer
-                else "train it again, or evaluate it with the version it is from"
-            )
+            f"{name}: '{path}' was written by {age} version of this library (checkpoint version "
+            f"{provenance['version']}, this one reads {CHECKPOINT_VERSION}); {fix}"
         )
-    checkpoint = Checkpoint(
-        path=path,
-        config=provenance["config"],
-        body_hash=provenance["body_hash"],
-        data_licence=provenance["data_licence"],
-        run=provenance["run"],
-        epoch=content["epoch"] + 1,
-        recipe=_recipe(provenance.get("observation"), path, name),
-        state=dict(content["state_dict"]),
-        file_hash=hashlib.sha256(data).hexdigest()[:16],
-    )
+    recipe = provenance.get("observation")
     try:
+        checkpoint = Checkpoint(
+            path=path,
+            **{key: provenance[key] for key in ("config", "body_hash", "data_licence", "run")},
+            epoch=content["epoch"] + 1,
+            recipe=None if recipe is None else ObservationRecipe(**recipe),
+            state=dict(content["state_dict"]),
+            file_hash=hashlib.sha256(data).hexdigest()[:16],
+        )
         _check_state(checkpoint.state, len(data))
         _check_content(checkpoint)
     except _CONTENT_ERRORS as error:
@@ -179,17 +149,6 @@ def read_checkpoint(path: str | Path, name: str = "ckpt_path") -> Checkpoint:
             f"{name}: '{path}': {reason(error, 1000)}; use another checkpoint of the run"
         ) from error
     return checkpoint
-
-
-def _recipe(content: Any, path: Path, name: str) -> ObservationRecipe | None:
-    if content is None:
-        return None
-    try:
-        return ObservationRecipe(**content)
-    except _CONTENT_ERRORS as error:
-        raise ValueError(
-            f"{name}: '{path}' holds no recipe of observations that is known here ({reason(error)})"
-        ) from error
 
 
 def _is_ours(content: Any, provenance: Any) -> bool:
@@ -212,11 +171,10 @@ def _is_ours(content: Any, provenance: Any) -> bool:
 def _is_resolved(config: Any) -> bool:
     """Whether a configuration is plain values: an interpolation would be resolved here, on this machine's values."""
     try:
-        return not any(
-            isinstance(value, str) and ("${" in value or value == "???") for value in plain_values(config)
-        )
+        texts = [value for value in plain_values(config) if isinstance(value, str)]
     except ValueError:
         return False
+    return not any("${" in text or text == "???" for text in texts)
 
 
 def _check_state(state: Mapping[Any, Any], file_size: int) -> None:
@@ -273,10 +231,7 @@ def _check_shapes(expected: Mapping[str, Tensor], got: Mapping[str, Tensor]) -> 
     shapes, got_shapes = (
         {name: tuple(value.shape) for name, value in state.items()} for state in (expected, got)
     )
-    if shapes != got_shapes:
-        differing = sorted(
-            name for name in shapes.keys() | got_shapes.keys() if shapes.get(name) != got_shapes.get(name)
-        )
+    if differing := sorted({name for name, _ in shapes.items() ^ got_shapes.items()}):
         name = differing[0]
         raise ValueError(
             f"holds the weights of another model: {len(differing)} tensors differ, the first is '{brief(name)}', "
@@ -285,12 +240,7 @@ def _check_shapes(expected: Mapping[str, Tensor], got: Mapping[str, Tensor]) -> 
 
 
 def load_state(module: torch.nn.Module, checkpoint: Checkpoint, argument: str = "ckpt_path") -> None:
-    """Load a checkpoint's weights into the module that its configuration describes.
-
-    Args:
-        module: The module.
-        checkpoint: The checkpoint.
-        argument: The argument to name in errors.
+    """Load a checkpoint's weights into the module that its configuration describes; errors name `argument`.
 
     Raises:
         ValueError: The weights belong to another model.
@@ -303,12 +253,7 @@ def load_state(module: torch.nn.Module, checkpoint: Checkpoint, argument: str = 
 
 
 def load_module(path: str | Path, kind: type[StageModule], name: str = "ckpt_path") -> tuple[Any, Checkpoint]:
-    """The trained module of a checkpoint, in evaluation mode, and the checkpoint.
-
-    Args:
-        path: The file.
-        kind: What the module must be: `JointDetector` or `MeshRegressor`.
-        name: The argument to name in errors.
+    """The trained module of a checkpoint, of the class `kind`, in evaluation mode; and the checkpoint.
 
     Raises:
         FileNotFoundError: There is no such file.

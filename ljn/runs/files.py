@@ -8,9 +8,9 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from ljn import reading
 from ljn.runs import layout
 
-_MAX_BYTES = 2**24
 _MAX_DEPTH = 32
 _MAX_METRIC = 1e100
 
@@ -21,7 +21,7 @@ def write_json(path: Path, content: Mapping[str, Any]) -> None:
 
 
 def write_text_atomically(path: Path, text: str) -> None:
-    """Write a text file, whole or not at all: after a failure the old one is there, and nothing beside it."""
+    """Write a text file, whole or not at all: after a failure the old file is unchanged and no draft is left."""
     # Jobs side by side write the same files, each in a process of its own.
     draft = path.with_name(f"{path.name}.{os.getpid()}.tmp")
     try:
@@ -41,20 +41,14 @@ def path_part(text: str) -> str:
 
 
 def read_json(path: Path) -> dict[str, Any] | None:
-    """The content of a JSON file, NaN and infinity as None.
+    """The content of a JSON file, NaN and infinity as None; None where there is no file, or a damaged one.
 
-    Returns:
-        None where there is no file, or a damaged one: no object, larger or deeper than any that is written here, or
-        with text that cannot be written again.
+    Damaged is what holds no object, is larger or deeper than any that is written here, or cannot be written again.
     """
     try:
-        with path.open("rb") as file:
-            data = file.read(_MAX_BYTES + 1)
-        if len(data) > _MAX_BYTES:
-            return None
-        content = json.loads(data.decode())
+        content = reading.read_json(path)
         _check(content)
-    except (OSError, ValueError, RecursionError):
+    except reading.READ_ERRORS:
         return None
     return _finite(content) if isinstance(content, dict) else None
 
@@ -62,9 +56,7 @@ def read_json(path: Path) -> dict[str, Any] | None:
 def read_metrics(directory: Path) -> dict[str, float] | None:
     """A run's metrics by name, NaN where one was not finite; None where there are none, or a damaged file."""
     content = read_json(directory / layout.METRICS)
-    if content is None or any(
-        isinstance(value, bool) or not isinstance(value, int | float | None) for value in content.values()
-    ):
+    if content is None or any(type(value) not in (int, float, type(None)) for value in content.values()):
         return None
     # What no network predicts would overflow in a mean.
     return {

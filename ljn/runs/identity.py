@@ -15,27 +15,23 @@ from ljn.runs.keys import Key, kind_of
 
 
 def identity(cfg: DictConfig, data_fingerprint: str) -> dict[str, Any]:
-    """Everything that a run's numbers depend on, as plain values.
+    """Everything that a run's numbers depend on, as plain values: every key that `ljn.runs.keys` gives to the run.
 
-    That is the value of every key that `ljn.runs.keys` gives to the run. Nulls are left out at any depth: what is not
-    set does not count, so that a key added later, null by default, changes no run's identity.
-
-    Args:
-        cfg: The composed configuration.
-        data_fingerprint: Of what the data's files hold, which their names do not say; see `DataModule`.
+    Nulls are left out at any depth, so that a key added later, null by default, changes no run's identity. The
+    fingerprint is that of what the data's files hold, which their names do not say; see `DataModule`.
     """
     cfg = cfg.copy()
     with open_dict(cfg):
-        cfg.paths.run_dir = ""  # named by what comes of this
-    kept: dict[str, Any] = _of_run(OmegaConf.to_container(cfg, resolve=True))
-    return kept | {"data_fingerprint": data_fingerprint, "predicted_body": predicted_body(cfg)}
+        cfg.paths.run_dir = ""  # its name depends on the identity
+    values: dict[str, Any] = _of_run(OmegaConf.to_container(cfg, resolve=True))
+    return values | {"data_fingerprint": data_fingerprint, "predicted_body": predicted_body(cfg)}
 
 
 def _of_run(value: Any, key: str = "") -> Any:
-    """What of a value is the run's; None and empty groups are nothing."""
+    """The part of a value that belongs to the run's identity; None where nothing does."""
     if isinstance(value, Mapping):
-        kept = {name: _of_run(entry, f"{key}.{name}".lstrip(".")) for name, entry in value.items()}
-        return {name: entry for name, entry in kept.items() if entry not in (None, {})}
+        entries = {name: _of_run(entry, f"{key}.{name}".lstrip(".")) for name, entry in value.items()}
+        return {name: entry for name, entry in entries.items() if entry not in (None, {})}
     if Key.RUN not in kind_of(key):
         return None
     # In a list every place counts.
@@ -53,9 +49,6 @@ def predicted_body(cfg: DictConfig) -> str | None:
 
 
 def config_hash(plain: Mapping[str, Any]) -> str:
-    """First 8 hex digits of the SHA-256 of plain values, whatever the order of their keys; 10 and 10.0 agree."""
-    return hashlib.sha256(json.dumps(_canonical(plain), sort_keys=True).encode()).hexdigest()[:8]
-
-
-def _canonical(value: Any) -> Any:
-    return map_floats(value, lambda number: int(number) if number.is_integer() else number)
+    """First 8 hex digits of the SHA-256 of plain values, independent of the keys' order; 10 and 10.0 agree."""
+    canonical = map_floats(plain, lambda number: int(number) if number.is_integer() else number)
+    return hashlib.sha256(json.dumps(canonical, sort_keys=True).encode()).hexdigest()[:8]

@@ -110,9 +110,6 @@ def kind_of(key: str) -> Key:
 
     A key that no file has, such as that of `+trainer.max_time=...`, is what its group is: never left out of an
     identity by mistake.
-
-    Args:
-        key: With dots, such as `data.camera.fx`.
     """
     row = _row(key)
     return KEYS[row] if row else Key.RUN

@@ -1,4 +1,4 @@
-"""The processes of one run, of which the first one alone writes, and how a signal ends them."""
+"""The processes of one run (only the first one writes files), and how a signal ends them."""
 
 import math
 import os
@@ -26,7 +26,7 @@ class Interruption(SystemExit):
 def end_on_signals() -> None:
     """Let SIGTERM and Ctrl-C raise `Interruption`, so that records and tables are written before the process ends.
 
-    By itself Python dies of SIGTERM at once, and Lightning turns it into a success. A signal that follows closely
+    Without this, SIGTERM ends Python at once, and Lightning turns it into a success. A signal that follows closely
     upon another (many tools send both a group and its first process one) does nothing. A handler that somebody else
     has set (a launcher's, say) stays.
     """
@@ -40,10 +40,7 @@ def end_on_signals() -> None:
         if last - before > _APART_S:
             raise Interruption(number)
 
-    for number, default in (
-        (signal.SIGTERM, signal.SIG_DFL),
-        (signal.SIGINT, signal.default_int_handler),
-    ):
+    for number, default in ((signal.SIGTERM, signal.SIG_DFL), (signal.SIGINT, signal.default_int_handler)):
         if signal.getsignal(number) == default:
             signal.signal(number, end)
 
@@ -62,18 +59,15 @@ def is_first_process() -> bool:
 
 
 def num_processes(trainer: Mapping[str, Any]) -> int:
-    """How many processes a trainer's configuration asks for: one a device.
-
-    Raises:
-        ValueError: It does not say how many.
-    """
+    """How many processes a trainer's configuration asks for: one a device; a `ValueError` where it does not say."""
     devices = trainer.get("devices", 1)
-    if isinstance(devices, str) and devices.isdigit():
-        devices = int(devices)
-    if isinstance(devices, int) and not isinstance(devices, bool) and devices >= 1:
-        return devices
-    if not isinstance(devices, str) and hasattr(devices, "__len__") and len(devices) >= 1:
-        return len(devices)
+    number = devices
+    if isinstance(devices, str):
+        number = int(devices) if devices.isdigit() else devices
+    elif hasattr(devices, "__len__"):
+        number = len(devices)
+    if type(number) is int and number >= 1:
+        return number
     raise ValueError(
         f"trainer.devices: expected a number of devices of 1 or more, or a list of their indices, got {devices!r}; "
         "say how many: trainer.devices=2"

@@ -128,17 +128,10 @@ def _commit() -> dict[str, Any]:
 
     def git(*arguments: str) -> str | None:
         try:
-            done = subprocess.run(
-                ["git", *arguments],
-                cwd=Path(__file__).parent,
-                capture_output=True,
-                text=True,
-                timeout=10,
-                check=True,
-            )
+            options: dict[str, Any] = {"stderr": subprocess.DEVNULL, "text": True, "timeout": 10}
+            return subprocess.check_output(["git", *arguments], cwd=Path(__file__).parent, **options).strip()
         except (OSError, subprocess.SubprocessError):
             return None
-        return done.stdout.strip()
 
     status = git("status", "--porcelain", "--untracked-files=no")
     return {"commit": git("rev-parse", "HEAD"), "is_dirty": None if status is None else bool(status)}

@@ -9,9 +9,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import yaml
 
-from ljn.reading import READ_ERRORS
+from ljn.reading import READ_ERRORS, read_arrays, read_yaml
 from ljn.runs import layout
 from ljn.runs.files import read_json, read_metrics
 from ljn.runs.keys import key_of, kind_of
@@ -20,43 +19,26 @@ Status = Literal["complete", "failed", "missing"]
 
 
 def settings(overrides: Iterable[str], preset: str) -> tuple[str, ...]:
-    """Those of a job's typed overrides that say what its run is, sorted.
-
-    Args:
-        overrides: As they were typed.
-        preset: The sweep's preset, which says nothing new.
-    """
-    kept = []
-    for override in overrides:
-        key = key_of(override)
-        if kind_of(key).is_setting and (key, override.partition("=")[2]) != ("preset", preset):
-            kept.append(override)
-    return tuple(sorted(kept))
+    """Those of a job's typed overrides that say what its run is, sorted; all jobs share the preset."""
+    is_preset = {line for line in overrides if (key_of(line), line.partition("=")[2]) == ("preset", preset)}
+    return tuple(
+        sorted(line for line in overrides if kind_of(key_of(line)).is_setting and line not in is_preset)
+    )
 
 
 @dataclass(frozen=True)
 class Run:
-    """A job of a sweep and what its run left.
+    """A job of a sweep and what its run left."""
 
-    Attributes:
-        experiment: Such as `detector/basic`; None in a free grid.
-        overrides: Of its task overrides, `settings`.
-        seed: Its seed.
-        directory: The run's directory; None for a job that never had one.
-        status: `missing`: it is not said to have failed, but has no result.
-        error: What a failed job died of.
-        metrics: Test metrics without `test/`: millimetres, pixels and percent; NaN where a number was not finite.
-        record: `record.json`, or nothing.
-    """
-
-    experiment: str | None
-    overrides: tuple[str, ...]
+    experiment: str | None  # such as `detector/basic`; None in a free grid
+    overrides: tuple[str, ...]  # of its task overrides, `settings`
     seed: int | None
-    directory: Path | None
-    status: Status
-    error: str | None = None
+    directory: Path | None  # the run's directory; None for a job that never had one
+    status: Status  # `missing`: nothing says that it failed, but it has no result
+    error: str | None = None  # of a failed job
+    # test metrics without `test/`: millimetres, pixels and percent; NaN where a number was not finite
     metrics: Mapping[str, float] = field(default_factory=dict)
-    record: Mapping[str, Any] = field(default_factory=dict)
+    record: Mapping[str, Any] = field(default_factory=dict)  # `record.json`, or nothing
 
     @property
     def name(self) -> str:
@@ -86,7 +68,7 @@ class Run:
 
     @property
     def is_root_relative(self) -> bool:
-        """Whether only its joints' positions beside the root mean something, as the record says."""
+        """Whether its joints are only defined relative to the root, as the record says."""
         return self.record.get("is_root_relative") is True
 
     @property
@@ -101,8 +83,8 @@ class Run:
         if self.directory is None:
             return {}
         try:
-            return mapping(yaml.safe_load((self.directory / layout.CONFIG).read_text()))
-        except (*READ_ERRORS, yaml.YAMLError):
+            return mapping(read_yaml(self.directory / layout.CONFIG))
+        except READ_ERRORS:
             return {}
 
     def setting(self, key: str) -> float | None:
@@ -124,11 +106,7 @@ class Run:
         return rows
 
     def curve(self, metric: str) -> dict[int, float]:
-        """The validation metric by epoch, counted from 1, over all attempts of the run.
-
-        Args:
-            metric: Without `val/`.
-        """
+        """A validation metric (without `val/`) by epoch, counted from 1, over all attempts of the run."""
         trained: set[int] = set()
         values: dict[int, float] = {}
         for row in self._csv_rows:
@@ -143,23 +121,18 @@ class Run:
         return {epoch + 1: values[epoch] for epoch in sorted(values) if epoch in trained}
 
     def sample_values(self, metric: str) -> tuple[np.ndarray, np.ndarray] | None:
-        """A metric's values of its test samples.
+        """Its test samples `(S, T)`, each by its number and its truth, and a metric's values of them `(S,)`.
 
-        Args:
-            metric: Its key.
-
-        Returns:
-            The samples `(S, T)`, each its number and what is true of it, by which samples of two runs can be told to be
-            the same, and their values `(S,)`; None where they are not known.
+        None where they are not known.
         """
         truth = _list(self.record.get("truth"))
         if self.directory is None or not truth:
             return None
         try:
-            with np.load(self.directory / layout.SAMPLES) as arrays:
-                ids, values = arrays["sample_id"], arrays[metric].astype(np.float64)
-                parts = [arrays[name].reshape(len(ids), -1) for name in truth]
-                samples = np.column_stack([ids, *parts]).astype(np.float64)
+            arrays = read_arrays(self.directory / layout.SAMPLES, ("sample_id", metric, *truth))
+            ids, values = arrays["sample_id"], arrays[metric].astype(np.float64)
+            parts = [arrays[name].reshape(len(ids), -1) for name in truth]
+            samples = np.column_stack([ids, *parts]).astype(np.float64)
         except READ_ERRORS:
             return None
         return (samples, values) if values.shape == (len(samples),) else None
@@ -167,28 +140,17 @@ class Run:
 
 @dataclass(frozen=True)
 class Sweep:
-    """A sweep: `sweep.json` and its runs.
+    """A sweep: `sweep.json` and its runs."""
 
-    Attributes:
-        name: Such as `table_3_2`.
-        preset: The sizes, such as `small`.
-        tables: Names of the tables that it fills.
-        command: What started it.
-        runs: In the order of the jobs; of jobs of the same experiment, settings and seed, the first.
-    """
-
-    name: str
-    preset: str
-    tables: tuple[str, ...]
-    command: str
-    runs: tuple[Run, ...]
+    name: str  # such as `table_3_2`
+    preset: str  # the sizes, such as `small`
+    tables: tuple[str, ...]  # names of the tables that it fills
+    command: str  # what started it
+    runs: tuple[Run, ...]  # in the jobs' order; of those of equal experiment, settings and seed, the first
 
 
 def read_sweep(directory: Path) -> Sweep:
-    """A sweep and its runs.
-
-    Args:
-        directory: Holds `sweep.json`.
+    """A sweep and its runs, from the directory that holds its `sweep.json`.
 
     Raises:
         FileNotFoundError: It does not.
@@ -202,20 +164,16 @@ def read_sweep(directory: Path) -> Sweep:
     content = read_json(path)
     if content is None or not isinstance(content.get("jobs"), list):
         raise ValueError(
-            f"'{path}': expected a JSON object with a list of jobs, got a damaged file; run the sweep again"
+            f"'{path}': expected an object with a list of jobs, got a damaged file; run the sweep again"
         )
     preset = str(content.get("preset") or "missing")
     runs: dict[Any, Run] = {}
     for job in read_jobs(directory):
         run = _read_run(job, directory, preset)
         runs.setdefault((run.experiment, run.overrides, run.seed), run)
-    return Sweep(
-        name=str(content.get("name") or directory.name),
-        preset=preset,
-        tables=tuple(map(str, _list(content.get("tables")))),
-        command=str(content.get("command") or "missing"),
-        runs=tuple(runs.values()),
-    )
+    name, command = content.get("name") or directory.name, content.get("command") or "missing"
+    tables = tuple(map(str, _list(content.get("tables"))))
+    return Sweep(str(name), preset, tables, str(command), tuple(runs.values()))
 
 
 def read_jobs(directory: Path) -> list[dict[str, Any]]:
@@ -226,40 +184,25 @@ def read_jobs(directory: Path) -> list[dict[str, Any]]:
 def job_of(content: Any) -> dict[str, Any]:
     """A job as `sweep.json` has it, read: what is of another type than it should be is None, or no override."""
     job = mapping(content)
-    texts = {
-        key: job[key] if isinstance(job.get(key), str) else None
-        for key in ("experiment", "run_dir", "status", "error")
-    }
-    seed = job.get("seed")
-    overrides = [str(override) for override in _list(job.get("overrides"))]
-    return texts | {"overrides": overrides, "seed": seed if isinstance(seed, int) else None}
+    types = {"experiment": str, "run_dir": str, "status": str, "error": str, "seed": int}
+    typed = {key: job[key] if isinstance(job.get(key), kind) else None for key, kind in types.items()}
+    return typed | {"overrides": [str(override) for override in _list(job.get("overrides"))]}
 
 
 def _read_run(job: Mapping[str, Any], sweep: Path, preset: str) -> Run:
     directory = _locate(job["run_dir"], sweep)
     record = (read_json(directory / layout.RECORD) if directory else None) or {}
-    prefix = "test/"
-    metrics = {
-        key.removeprefix(prefix): value
-        for key, value in ((read_metrics(directory) if directory else None) or {}).items()
-        if key.startswith(prefix)
-    }
+    everything = (read_metrics(directory) if directory else None) or {}
+    metrics = {key[5:]: value for key, value in everything.items() if key.startswith("test/")}
     error = job["error"] or record.get("error")
     status: Status = "complete"
     if job["status"] == "failed" or (not metrics and record.get("status") == "failed"):
         status, metrics = "failed", {}
     elif not metrics:
         status = "missing"
-    return Run(
-        experiment=job["experiment"],
-        overrides=settings(job["overrides"], preset),
-        seed=job["seed"],
-        directory=directory,
-        status=status,
-        error=None if status == "complete" or error is None else str(error),
-        metrics=metrics,
-        record=record,
-    )
+    error = None if status == "complete" or error is None else str(error)
+    overrides = settings(job["overrides"], preset)
+    return Run(job["experiment"], overrides, job["seed"], directory, status, error, metrics, record)
 
 
 def _locate(run_dir: str | None, sweep: Path) -> Path | None:
@@ -298,5 +241,5 @@ def _list(value: Any) -> list[Any]:
 
 def varying(settings: Iterable[tuple[str, ...]]) -> frozenset[str]:
     """The overrides that some of these have and others have not."""
-    sets: list[set[str]] = [set(overrides) for overrides in settings]
-    return frozenset(sets[0].union(*sets) - sets[0].intersection(*sets)) if sets else frozenset()
+    sets = list(map(frozenset, settings)) or [frozenset()]
+    return sets[0].union(*sets) - sets[0].intersection(*sets)

@@ -51,7 +51,7 @@ def cross(cfg: DictConfig) -> dict[str, float]:
 
 
 def _check_trains(cfg: DictConfig) -> None:
-    """Raise a `ValueError` unless the experiment that is said to be trained is configured as this row is.
+    """Raise a `ValueError` unless the experiment that `task.trains` names is configured as this row is.
 
     Without Hydra's own start there is no other experiment to compose: the caller has composed this one.
     """
@@ -79,5 +79,5 @@ def _trained(cfg: DictConfig, name: str) -> Path:
 
 def _composed(experiment: str) -> DictConfig:
     """The configuration of another experiment with this call's sizes, data, trainer and the like."""
-    kept = [line for line in typed_overrides() if kind_of(key_of(line)).is_shared]
-    return compose("config", [f"experiment={experiment}", *kept])
+    shared = [line for line in typed_overrides() if kind_of(key_of(line)).is_shared]
+    return compose("config", [f"experiment={experiment}", *shared])

@@ -45,14 +45,10 @@ def evaluate(cfg: DictConfig) -> dict[str, float]:
 def evaluate_checkpoint(
     cfg: DictConfig, path: str | Path, overrides: list[str], name: str | None = None, reuses: bool = False
 ) -> dict[str, float]:
-    """Test a checkpoint; see `evaluate`.
+    """Test a checkpoint, with overrides of single values, as they would be typed; see `evaluate`.
 
-    Args:
-        cfg: The call's composed configuration; `paths.run_dir` is set here.
-        path: The checkpoint.
-        overrides: Changes of single values, as they would be typed.
-        name: Name of the evaluation's directory and record; None for that of the checkpoint.
-        reuses: Whether an equal evaluation, if there is a complete one, is taken instead.
+    Sets `paths.run_dir` of the call's configuration. The evaluation has the checkpoint's name or `name`; with `reuses`,
+    an equal evaluation, if there is a complete one, is taken instead.
     """
     checkpoint = read_checkpoint(path)
     call, cfg = cfg, with_checkpoint_config(cfg, checkpoint, overrides)

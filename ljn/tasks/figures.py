@@ -25,19 +25,12 @@ _LOG = logging.getLogger(__name__)
 
 
 class Column(NamedTuple):
-    """A checkpoint in a figure.
+    """A checkpoint in a figure."""
 
-    Attributes:
-        title: What it is and what noise its initial joints have.
-        module: The trained module.
-        batch: The test samples with the initial joints that it gets.
-        facts: For `figures.json`.
-    """
-
-    title: str
+    title: str  # what it is and what noise its initial joints have
     module: Any
-    batch: Batch
-    facts: dict[str, Any]
+    batch: Batch  # the test samples with the initial joints that it gets
+    facts: dict[str, Any]  # for `figures.json`
 
 
 def figures(cfg: DictConfig) -> dict[str, float]:
@@ -55,7 +48,7 @@ def figures(cfg: DictConfig) -> dict[str, float]:
 
     Returns:
         The mean error of the drawn samples in each column, as `figures/joints_0` and so on, mm: MPJPE (root-aligned
-        for a detector whose joints only mean something beside the root) and APVE.
+        for a detector whose joints are only defined relative to the root) and APVE.
 
     Raises:
         ValueError: No checkpoint is given, one is of the other stage, or their test sets differ.
@@ -67,9 +60,8 @@ def figures(cfg: DictConfig) -> dict[str, float]:
             "task.detectors, task.regressors: expected checkpoints, got none; python run.py task=figures "
             "'task.detectors=[PROPOSED.ckpt,BASELINE.ckpt]' 'task.regressors=[MESH.ckpt]'"
         )
-    noise = (
-        [None] * len(detectors) if cfg.task.keypoint_noise_px is None else list(cfg.task.keypoint_noise_px)
-    )
+    noise = cfg.task.keypoint_noise_px
+    noise = [None] * len(detectors) if noise is None else list(noise)
     if len(noise) != len(detectors):
         raise ValueError(
             f"task.keypoint_noise_px: expected one value for each of the {len(detectors)} detectors, got {noise}"
@@ -88,60 +80,59 @@ def figures(cfg: DictConfig) -> dict[str, float]:
     _check_same_samples([column for columns in pages.values() for column in columns])
 
     metrics: dict[str, float] = {}
-    said: dict[str, Any] = {}
+    drawn: dict[str, Any] = {}
     for page, columns in pages.items():
         if not columns:
             continue
         draw = _draw_joints if page == "joints" else _draw_meshes
         figure, errors = draw(columns)
         figure.savefig(directory / f"{page}.png")
-        said[page] = [
+        drawn[page] = [
             column.facts | {"title": column.title, "errors_mm": error.tolist()}
             for column, error in zip(columns, errors)
         ]
         metrics |= {f"figures/{page}_{number}": float(error.mean()) for number, error in enumerate(errors)}
         _LOG.info("%d samples: %s", len(errors[0]), directory / f"{page}.png")
-    write_json(directory / "figures.json", said)
+    write_json(directory / "figures.json", drawn)
     return metrics
 
 
 def _column(cfg: DictConfig, path: str, kind: type, key: str, overrides: Sequence[str]) -> Column:
     """A checkpoint and the test samples as it gets them."""
     module, checkpoint = load_module(path, kind, key)
-    own = with_checkpoint_config(cfg, checkpoint, [*typed_overrides(), *overrides])
-    validate(own)
-    prepare_process(own)
-    datamodule: DataModule = build(own.data)
+    number, cfg = (
+        cfg.task.num_samples,
+        with_checkpoint_config(cfg, checkpoint, [*typed_overrides(), *overrides]),
+    )
+    validate(cfg)
+    prepare_process(cfg)
+    datamodule: DataModule = build(cfg.data)
     datamodule.takes = (*module.takes, "points")
     datamodule.prepare_data()
     check_bodies(checkpoint, {body.hash for body in datamodule.bodies} | set(module.body_hashes))
-    num_test, wanted = own.data.num_test, cfg.task.num_samples
-    if wanted > num_test:
+    if number > (num_test := cfg.data.num_test):
         raise ValueError(
-            f"task.num_samples: '{path}' has {num_test} test samples, got {wanted}; ask for fewer"
+            f"task.num_samples: '{path}' has {num_test} test samples, got {number}; ask for fewer"
         )
     # The middles of equal parts of the test set.
-    indices = [(2 * number + 1) * num_test // (2 * wanted) for number in range(wanted)]
+    indices = [(2 * index + 1) * num_test // (2 * number) for index in range(number)]
     batch, _ = datamodule.examples("test", indices)
-    source = "detector" if own.data.detector_ckpt else own.data.synthesis.initial_joints
-    synthesis = own.data.synthesis
+    synthesis = cfg.data.synthesis
+    source = "detector" if cfg.data.detector_ckpt else synthesis.initial_joints
     initial = {"lifted": f"{synthesis.keypoint_noise_px:g} px", "noised": f"{synthesis.joint_noise_m:g} m"}
-    facts = {"checkpoint": str(checkpoint.path), "hash": checkpoint.file_hash, "run": checkpoint.run}
-    return Column(
-        f"{own.name}, {initial.get(source, source)}",
-        module,
-        batch,
-        facts | {"samples": batch["sample_id"].tolist()},
-    )
+    facts: dict[str, Any] = {"checkpoint": str(checkpoint.path), "hash": checkpoint.file_hash}
+    facts |= {"run": checkpoint.run, "samples": batch["sample_id"].tolist()}
+    return Column(f"{cfg.name}, {initial.get(source, source)}", module, batch, facts)
 
 
 def _check_same_samples(columns: Sequence[Column]) -> None:
     first = columns[0]
     for column in columns[1:]:
-        same = [
-            torch.equal(column.batch[name], first.batch[name]) for name in ("sample_id", "pose", "joints")
-        ]
-        if not all(same):
+        pairs = (
+            (entry.batch["sample_id"], entry.batch["pose"], entry.batch["joints"])
+            for entry in (first, column)
+        )
+        if not all(map(torch.equal, *pairs)):
             raise ValueError(
                 f"task.detectors, task.regressors: the test sets of '{first.facts['checkpoint']}' and "
                 f"'{column.facts['checkpoint']}' differ (data.num_test, data.pool_seed, data.eval_seed, camera or "
@@ -160,9 +151,7 @@ def _draw_joints(columns: Sequence[Column]) -> tuple[Any, list[torch.Tensor]]:
             title = f"{title}, root-aligned"
         error = mpjpe(predicted, joints)
         errors.append(error)
-        titles = [f"{title}: {value:.0f} mm" for value in error]
-        arrays = (values.numpy() for values in (batch["points"][..., :3], joints, predicted))
-        drawn.append([Sample(*row) for row in zip(*arrays, titles)])
+        drawn.append(_samples(Sample, title, error, batch, joints, predicted))
     return draw_samples(_by_rows(drawn), len(columns)), errors
 
 
@@ -172,13 +161,18 @@ def _draw_meshes(columns: Sequence[Column]) -> tuple[Any, list[torch.Tensor]]:
     for title, module, batch, _ in columns:
         seen = module.evaluate(batch, module.test_metrics)
         errors.append(seen["apve"])
-        titles = [f"{title}: {value:.0f} mm" for value in seen["apve"]]
-        arrays = (
-            values.numpy() for values in (batch["points"][..., :3], seen["vertices"], seen["pred_vertices"])
+        drawn.append(
+            _samples(MeshSample, title, seen["apve"], batch, seen["vertices"], seen["pred_vertices"])
         )
-        drawn.append([MeshSample(*row) for row in zip(*arrays, titles)])
     faces = columns[0].module.body.faces.numpy()
     return draw_meshes(_by_rows(drawn), faces, len(columns)), errors
+
+
+def _samples(kind: Any, title: str, errors: torch.Tensor, batch: Batch, *values: torch.Tensor) -> list[Any]:
+    """What is drawn of each sample, under its error."""
+    titles = [f"{title}: {error:.0f} mm" for error in errors]
+    arrays = (value.numpy() for value in (batch["points"][..., :3], *values))
+    return [kind(*row) for row in zip(*arrays, titles)]
 
 
 def _by_rows(columns: list[list[Any]]) -> list[Any]:

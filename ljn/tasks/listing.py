@@ -33,14 +33,14 @@ def descriptions(directory: Path) -> dict[str, str]:
 
 
 def _first_comment(text: str) -> str:
-    said: list[str] = []
+    sentence: list[str] = []
     for line in text.splitlines():
         if not line.startswith("#"):
             break
         comment = line.lstrip("# ").rstrip()
         if comment.startswith("@package") or "python run.py" in comment:
             continue
-        said.append(comment)
+        sentence.append(comment)
         if comment.endswith("."):
             break
-    return " ".join(said)
+    return " ".join(sentence)

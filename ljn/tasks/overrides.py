@@ -7,7 +7,6 @@ from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
 
-from ljn.building import check_targets
 from ljn.runs.checkpoints import Checkpoint
 from ljn.runs.keys import CONFIG_GROUPS, Key, key_of, kind_of
 
@@ -30,15 +29,9 @@ def with_checkpoint_config(cfg: DictConfig, checkpoint: Checkpoint, overrides: l
 
     Of the checkpoint's groups, the keys that `ljn.runs.keys` gives to the machine or the call have this call's values.
 
-    Args:
-        cfg: The call's composed configuration.
-        checkpoint: The checkpoint.
-        overrides: The call's overrides, as they were typed.
-
     Raises:
         ValueError: An override is about something that the checkpoint decides.
     """
-    check_targets({name: checkpoint.config.get(name) for name in CONFIG_GROUPS}, "the checkpoint's config")
     plain: dict[str, Any] = OmegaConf.to_container(cfg, resolve=False)  # type: ignore[assignment]
     plain |= {name: _with_call(checkpoint.config[name], plain[name], name) for name in CONFIG_GROUPS}
     merged = OmegaConf.create(plain)
@@ -58,11 +51,9 @@ def _with_call(stored: Any, call: Any, key: str) -> Any:
 
 
 def apply_overrides(cfg: DictConfig, overrides: list[str]) -> None:
-    """Change single values of data, trainer and body in a resolved configuration.
+    """Change single values of data, trainer and body in a resolved configuration, a checkpoint's or part of one.
 
-    Args:
-        cfg: What a checkpoint's configuration is part of.
-        overrides: As they would be typed; those about what the checkpoint has no say in are left out.
+    Overrides that the checkpoint does not decide about are left out.
 
     Raises:
         ValueError: An override is about something that the checkpoint decides, or names no value.

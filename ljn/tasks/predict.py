@@ -14,11 +14,12 @@ from tqdm import tqdm
 from ljn.body.skeleton import JOINT_NAMES
 from ljn.geometry.camera import Camera
 from ljn.geometry.distance import distances_to_mesh
+from ljn.optional import import_trimesh
 from ljn.pipeline.frames import FrameFiles, find_frames, predict_frames
 from ljn.pipeline.inputs import read_camera
 from ljn.pipeline.pictures import draw_prediction
 from ljn.pipeline.pipeline import Pipeline, Prediction
-from ljn.pipeline.writing import import_trimesh, write_arrays, write_mesh
+from ljn.pipeline.writing import write_arrays, write_mesh
 from ljn.runs.files import path_part, write_json
 from ljn.tasks.validation import check_writable
 
@@ -34,8 +35,8 @@ _COMMAND = (
 def predict(cfg: DictConfig) -> dict[str, float]:
     """Predict joints and meshes of a depth image, or of each in a folder, into `output_dir/predictions/NAME`.
 
-    A frame of a folder that cannot be predicted is reported and costs the others nothing. `predictions.json` says
-    what became of each frame.
+    A frame of a folder that cannot be predicted is reported, and all others are predicted. `predictions.json` lists
+    each frame's outcome.
 
     Args:
         cfg: The composed configuration; of it `task`, `ckpt_path`, `paths`, `num_threads` and `trainer.accelerator`
@@ -69,12 +70,10 @@ def predict(cfg: DictConfig) -> dict[str, float]:
 
     results = _predict(pipeline, frames, camera, directory, may_fail=Path(task.input).is_dir())
     failed = [name for name, result in results.items() if "error" in result]
-    distances = [
-        result["median_distance_mm"] for result in results.values() if "median_distance_mm" in result
-    ]
+    name = "median_distance_mm"
     metrics = {"predict/frames": float(len(results) - len(failed))}
-    if distances:
-        metrics["predict/median_distance_mm"] = float(np.median(distances))
+    if distances := [result[name] for result in results.values() if name in result]:
+        metrics[f"predict/{name}"] = float(np.median(distances))
     summary = {
         **metrics,
         "predict/failed": len(failed),

@@ -26,11 +26,7 @@ def is_job_of_sweep() -> bool:
 
 
 def sweep_name(hydra: Any) -> str:
-    """What a multirun is called: a grid of the user's own has no name but the time of its start.
-
-    Args:
-        hydra: Hydra's own part of the configuration.
-    """
+    """What a multirun is called, by Hydra's part of its configuration; a free grid by the time of its start."""
     return hydra.runtime.choices.get("sweep") or f"grid-{Path(hydra.sweep.dir).name}"
 
 
@@ -72,13 +68,10 @@ def check_processes(plain: Mapping[str, Any]) -> None:
             )
 
 
-def own_devices(trainer: Mapping[str, Any]) -> dict[str, list[int]]:
+def unclaimed_devices(trainer: Mapping[str, Any]) -> dict[str, list[int]]:
     """For a job of a sweep on a machine with several GPUs: `devices`, one that no other job uses; else nothing.
 
-    Jobs that run side by side would all take the first one.
-
-    Args:
-        trainer: The trainer's configuration.
+    Jobs that run in parallel would all take the first one.
     """
     import torch
 
@@ -92,13 +85,9 @@ _claimed: dict[int, IO[str]] = {}
 
 
 def claim_gpu(count: int, directory: Path | None = None) -> int:
-    """The index of a GPU that no other process of this machine has claimed, for as long as this process lives.
+    """The index of one of `count` visible GPUs that no other process has claimed; where all are taken, of any.
 
-    Where all are taken, one is shared.
-
-    Args:
-        count: How many GPUs this process sees.
-        directory: Where the claims are kept, as locked files.
+    A claim is a locked file in `directory` and ends with this process.
     """
     import fcntl
 
@@ -125,10 +114,10 @@ def check_trains_in_processes(module: "nn.Module", number: int) -> None:
 
     if number == 1:
         return
-    reason = None
     if not any(parameter.requires_grad for parameter in module.parameters()):
         reason = "a yardstick is fitted in closed form, in seconds, by one process"
     elif any(isinstance(part, _BatchNorm) for part in module.modules()):
-        reason = "the network normalises over the batch, which each process would do over its own part"
-    if reason:
-        raise ValueError(f"trainer.devices: {reason}; use trainer.devices=1, got {number} devices")
+        reason = "the network normalises over the batch, which each process would do over its part alone"
+    else:
+        return
+    raise ValueError(f"trainer.devices: {reason}; use trainer.devices=1, got {number} devices")

@@ -12,14 +12,11 @@ _LOG = logging.getLogger(__name__)
 
 
 def report(cfg: DictConfig) -> dict[str, float]:
-    """Write a sweep's tables and page again, from what its runs left; print the tables.
+    """Write a sweep's tables and page again, from what its runs left; print the tables, return nothing.
 
     Args:
         cfg: The composed configuration; `task.directory` is the sweep's directory, which holds `sweep.json`: null for
             the last one that changed below `output_dir/sweeps`.
-
-    Returns:
-        Nothing: the numbers are in the tables.
 
     Raises:
         FileNotFoundError: There is no such sweep.

@@ -19,7 +19,7 @@ from ljn.runs.checkpoints import AtomicCheckpointIO, Provenance
 from ljn.runs.files import path_part, write_text_atomically
 from ljn.runs.processes import is_first_process, num_processes
 from ljn.runs.random_state import RandomState
-from ljn.tasks.processes import own_devices
+from ljn.tasks.processes import unclaimed_devices
 
 # What Lightning says of things that are as they should be.
 _EXPECTED_WARNINGS = (
@@ -76,19 +76,14 @@ def build_trainer(
         logger=build_each(cfg.logger),
         plugins=[AtomicCheckpointIO()],
         use_distributed_sampler=False,  # the data module gives each process its part, and none twice
-        **own_devices(cfg.trainer),
+        **unclaimed_devices(cfg.trainer),
     )
 
 
 def finite_metrics(trainer: lightning.Trainer) -> dict[str, float]:
-    """The metrics of the trainer's last validation or test.
-
-    Raises:
-        FloatingPointError: One of them is not finite.
-    """
+    """The metrics of the trainer's last validation or test; a `FloatingPointError` where one is not finite."""
     metrics = {name: float(value) for name, value in trainer.callback_metrics.items()}
-    bad = [name for name, value in metrics.items() if not math.isfinite(value)]
-    if bad:
+    if bad := [name for name, value in metrics.items() if not math.isfinite(value)]:
         raise FloatingPointError(
             f"{', '.join(bad)} not finite: the model predicts NaN or infinity; lower the learning rate"
         )

@@ -15,10 +15,7 @@ _LOG = logging.getLogger(__name__)
 
 
 def show(cfg: DictConfig) -> dict[str, float]:
-    """Draw the first training samples of the configured data on a page, `output_dir/show.png`.
-
-    Args:
-        cfg: The composed configuration; `task.num_samples` says how many.
+    """Draw the first `task.num_samples` training samples of the configured data on `output_dir/show.png`.
 
     Returns:
         The mean error of their initial joints, mm, as `show/initial_mpjpe`.

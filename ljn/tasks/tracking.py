@@ -1,4 +1,4 @@
-"""Trackers: what they are told once, their end, and a sweep's table."""
+"""Trackers: what is logged once of a run, the run's end, and a sweep's table."""
 
 import os
 from collections.abc import Iterator, Mapping, Sequence
@@ -17,24 +17,19 @@ from ljn.runs.identity import config_hash
 def tracking(
     trainer: lightning.Trainer, run_id: str, config: Mapping[str, Any], trained_by: str | None = None
 ) -> Iterator[None]:
-    """While it lasts, the trainer's loggers follow one run; then W&B's run is ended, as failed after an error.
+    """A context in which the trainer's loggers follow one run; at its end W&B's run ends, as failed after an error.
 
     Without that end, jobs of one process would share a run. W&B's job type is `train` or `evaluate`; of a
     validation metric its summary keeps the best value. An evaluation has the directory and W&B's id of its
-    training run in its config, as `trained_by` and `trained_by_id`, and in its notes.
-
-    Args:
-        trainer: The trainer whose loggers are meant.
-        run_id: Hash that names the run: W&B's own id, with which a resumed run goes on.
-        config: Resolved configuration, plain values.
-        trained_by: For an evaluation: the training run that the checkpoint came from.
+    training run in its config, as `trained_by` and `trained_by_id`, and in its notes. `run_id` is the hash that names
+    the run, and W&B's id of it, with which a resumed run goes on; `config` is resolved, plain values.
     """
     _quieten_wandb()
-    told = dict(config)
+    hyperparameters = dict(config)
     about: dict[str, Any] = {"id": run_id, "resume": "allow", "job_type": "train"}
     if trained_by:
         # A run's directory ends with the hash that is its id.
-        told |= {"trained_by": trained_by, "trained_by_id": trained_by.rpartition("-")[2]}
+        hyperparameters |= {"trained_by": trained_by, "trained_by_id": trained_by.rpartition("-")[2]}
         about |= {"job_type": "evaluate", "notes": f"Evaluation of {trained_by}"}
     loggers = [logger for logger in trainer.loggers if isinstance(logger, WandbLogger)]
     exit_code = 1
@@ -45,7 +40,7 @@ def tracking(
             for metric, summary in summaries(config).items():
                 logger.experiment.define_metric(metric, step_metric="trainer/global_step", summary=summary)
         for each in trainer.loggers:
-            each.log_hyperparams(told)
+            each.log_hyperparams(hyperparameters)
         yield
         exit_code = 0
     finally:
@@ -56,32 +51,21 @@ def tracking(
 
 
 def summaries(config: Mapping[str, Any]) -> dict[str, str]:
-    """What of a metric's values a run's summary keeps: `min` or `max`, the best one, or `last`.
-
-    A test's metrics are logged once, and are left out.
-
-    Args:
-        config: Resolved configuration, plain values, whose module says what it logs.
-    """
+    """Which of a validation metric's values a run's summary keeps: `min`, `max` or `last`."""
     module: Any = get_class(config["module"]["_target_"])
-    kept = {None: "last", False: "min", True: "max"}
+    best = {None: "last", False: "min", True: "max"}
     metrics = module.metrics(prefix="val/").items()
-    return {"train/loss": "min"} | {name: kept[metric.higher_is_better] for name, metric in metrics}
+    return {"train/loss": "min"} | {name: best[metric.higher_is_better] for name, metric in metrics}
 
 
 def log_table(
     name: str, rows: Sequence[Mapping[str, Any]], logger: Mapping[str, Any] | None, directory: str | Path
 ) -> None:
-    """Log a sweep's table to W&B, as a run of its own in the sweep's group, of the job type `report`.
+    """Log a sweep's table to W&B, as a separate run in the sweep's group, of the job type `report`.
 
-    The table of the same name, group and project is the same run: it takes the place of the one before. Nothing
-    happens where W&B is not among the loggers.
-
-    Args:
-        name: The table's name.
-        rows: Its rows; a column for each key that any of them has. What is no number or text becomes text.
-        logger: The loggers' configuration of the sweep's jobs, plain or not: `wandb` says project, group and offline.
-        directory: Where the run's files go.
+    The table of the same name, group and project is the same run and is replaced. Nothing happens where W&B is not
+    among the loggers of the sweep's jobs. A table has a column for each key that any of its rows has; what is no
+    number or text becomes text.
     """
     node = (logger or {}).get("wandb")
     if node is None or not rows:
@@ -90,7 +74,7 @@ def log_table(
     import wandb
 
     columns = list(dict.fromkeys(key for row in rows for key in row))
-    cells = [[_cell(row.get(column)) for column in columns] for row in rows]
+    cells = [[_as_cell(row.get(column)) for column in columns] for row in rows]
     project, group = node.get("project"), node.get("group")
     Path(directory).mkdir(parents=True, exist_ok=True)
     with wandb.init(
@@ -108,7 +92,7 @@ def log_table(
         run.log({name: wandb.Table(columns=[*columns], data=cells, allow_mixed_types=True)})
 
 
-def _cell(value: Any) -> Any:
+def _as_cell(value: Any) -> Any:
     return value if value is None or isinstance(value, bool | int | float | str) else str(value)
 
 

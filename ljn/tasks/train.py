@@ -24,9 +24,6 @@ _LOG = logging.getLogger(__name__)
 def train(cfg: DictConfig) -> dict[str, float]:
     """Train and test one configuration, or find it already done, or resume it where it was cut off.
 
-    Args:
-        cfg: The composed configuration; `paths.run_dir` is set here.
-
     Returns:
         The best checkpoint's validation and test metrics, also in `metrics.json` of the run's directory.
 

@@ -47,8 +47,8 @@ def check_writable(directory: Path, name: str = "paths.output_dir") -> None:
 
 
 def _check_radii(model: dict[str, Any]) -> None:
-    radii = model.get("radii_m")
-    if "radii_m" in model and not (isinstance(radii, list) and len(radii) == NUM_JOINTS):
+    radii = model.get("radii_m", [0] * NUM_JOINTS)
+    if not (isinstance(radii, list) and len(radii) == NUM_JOINTS):
         got = len(radii) if isinstance(radii, list) else repr(radii)
         raise ValueError(
             f"model.radii_m: expected {NUM_JOINTS} radii, one for each joint ({', '.join(JOINT_NAMES)}), got {got}"
@@ -56,33 +56,33 @@ def _check_radii(model: dict[str, Any]) -> None:
 
 
 def _check_integers(plain: dict[str, Any]) -> None:
-    smallest: dict[int, dict[str, tuple[str, ...]]] = {
-        1: {
-            "data.observation": ("num_points", "crop_px"),
-            "data": ("num_train", "num_val", "num_test", "batch_size", "prefetch_batches"),
-            "model": ("group_size",),
-            "trainer": ("max_epochs",),
-        },
-        0: {"data": ("num_workers", "seed", "pool_seed", "eval_seed")},
-    }
-    for least, groups in smallest.items():
-        for group, keys in groups.items():
-            for key in keys:
-                values: Any = plain
-                for part in group.split("."):
-                    values = (values or {}).get(part) or {}
-                if key in values and not (isinstance(values[key], int) and values[key] >= least):
-                    raise ValueError(
-                        f"{group}.{key}: expected an integer of {least} or more, got {values[key]!r}"
-                    )
+    smallest = (
+        ("data.observation", 1, ("num_points", "crop_px")),
+        ("data", 1, ("num_train", "num_val", "num_test", "batch_size", "prefetch_batches")),
+        ("data", 0, ("num_workers", "seed", "pool_seed", "eval_seed")),
+        ("model", 1, ("group_size",)),
+        ("trainer", 1, ("max_epochs",)),
+    )
+    for group, least, keys in smallest:
+        values = _group(plain, group)
+        for key in keys:
+            if key in values and not (isinstance(values[key], int) and values[key] >= least):
+                raise ValueError(
+                    f"{group}.{key}: expected an integer of {least} or more, got {values[key]!r}"
+                )
     if plain["num_threads"] is not None and plain["num_threads"] < 1:
         raise ValueError(f"num_threads: expected 1 or more, or null, got {plain['num_threads']}")
 
 
+def _group(plain: Any, key: str) -> dict[str, Any]:
+    """The mapping under a key with dots; empty where there is none."""
+    for part in key.split("."):
+        plain = plain.get(part) if isinstance(plain, dict) else None
+    return plain if isinstance(plain, dict) else {}
+
+
 def _check_set_abstractions(plain: dict[str, Any]) -> None:
-    trunk = (plain.get("model") or {}).get("trunk")
-    if not isinstance(trunk, dict):
-        return
+    trunk = _group(plain, "model.trunk")
     for key in ("num_centres", "group_sizes"):
         values = trunk.get(key, [1])
         if not (isinstance(values, list) and values and all(isinstance(n, int) and n >= 1 for n in values)):
@@ -98,7 +98,7 @@ def _check_set_abstractions(plain: dict[str, Any]) -> None:
             f"{name}: expected no number greater than the one before, got {centres}: each set abstraction takes its "
             f"centres from those before; set preset.mesh.num_centres={_as_override(sorted(centres, reverse=True))}"
         )
-    num_points = ((plain.get("data") or {}).get("observation") or {}).get("num_points")
+    num_points = _group(plain, "data.observation").get("num_points")
     if num_points is not None and centres[0] > num_points:
         fitting = _as_override(min(number, num_points) for number in centres)
         raise ValueError(
@@ -113,12 +113,8 @@ def _as_override(values: Iterable[int]) -> str:
 
 
 def _check_learning_rate(plain: dict[str, Any]) -> None:
-    optimizer = (plain.get("module") or {}).get("optimizer") or {}
-    if "lr" not in optimizer:
-        return
-    rate = optimizer["lr"]
-    is_number = isinstance(rate, int | float) and not isinstance(rate, bool)
-    if not (is_number and 0 < rate < math.inf):
+    rate = _group(plain, "module.optimizer").get("lr", 1)
+    if not (type(rate) in (int, float) and 0 < rate < math.inf):
         raise ValueError(
             f"module.optimizer.lr: expected a positive finite number, got {rate!r}; set preset.learning_rate=1e-3"
         )
@@ -132,30 +128,32 @@ def _check_tables(plain: dict[str, Any]) -> None:
 def _check_monitors(plain: dict[str, Any]) -> None:
     # The module says what it logs; its target has passed `check_targets`.
     module: Any = get_class(plain["module"]["_target_"])
-    keys = list(module.metrics().keys(keep_base=True))
-    known = {f"val/{key}" for key in keys} | {"train/loss"}
-    monitored: dict[str, tuple[Any, set[str]]] = {
-        f"callbacks.{name}.monitor": ((node or {}).get("monitor"), known)
-        for name, node in (plain.get("callbacks") or {}).items()
+    metrics = module.metrics().items()
+    modes = {
+        f"val/{key}": {True: "max", False: "min"}.get(metric.higher_is_better) for key, metric in metrics
     }
-    monitored["optimized_metric"] = (plain["optimized_metric"], known | {f"test/{key}" for key in keys})
+    modes["train/loss"] = "min"
+    callbacks = {f"callbacks.{name}": node for name, node in _group(plain, "callbacks").items() if node}
+    monitored = {f"{name}.monitor": (node.get("monitor"), set(modes)) for name, node in callbacks.items()}
+    monitored["optimized_metric"] = (
+        plain["optimized_metric"],
+        {*modes, *(f"test/{key}" for key, _ in metrics)},
+    )
     for name, (metric, choices) in monitored.items():
         if metric is not None and metric not in choices:
             raise ValueError(
                 f"{name}: no metric '{metric}' is logged; choose one of {', '.join(sorted(choices))}"
             )
-    is_better_higher = {f"val/{key}": metric.higher_is_better for key, metric in module.metrics().items()}
-    for name, node in (plain.get("callbacks") or {}).items():
-        if not node or node.get("monitor") is None or "mode" not in node:
+    for name, node in callbacks.items():
+        if node.get("monitor") is None or "mode" not in node:
             continue
         metric, mode = node["monitor"], node["mode"]
-        wanted = {True: "max", False: "min", None: None}[is_better_higher.get(metric, False)]
-        if wanted is None:
+        if modes[metric] is None:
             raise ValueError(
-                f"callbacks.{name}.monitor: '{metric}' describes the data, and no model makes it better; choose "
-                f"another of {', '.join(sorted(key for key, value in is_better_higher.items() if value is not None))}"
+                f"{name}.monitor: '{metric}' describes the data, and no model makes it better; choose another of "
+                f"{', '.join(sorted(key for key, wanted in modes.items() if wanted))}"
             )
-        if mode != wanted:
+        if mode != modes[metric]:
             raise ValueError(
-                f"callbacks.{name}.mode: '{mode}' would keep the worst '{metric}'; add callbacks.{name}.mode={wanted}"
+                f"{name}.mode: '{mode}' would keep the worst '{metric}'; add {name}.mode={modes[metric]}"
             )

@@ -22,7 +22,6 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from datamodules.placement import floor_height
 from datamodules.sources import SPLITS, PoseRecords
 from datamodules.sources.embedded import EmbeddedSource
 from datamodules.sources.embedded.joint_limits import ARM_AXES, RANGES, Ranges, within_limits
@@ -285,7 +284,7 @@ def draw_sheet(records: PoseRecords) -> Image.Image:
         torch.from_numpy(records.gender),
     ).vertices
     vertices[..., :2] -= (vertices[..., :2].amin(1) + vertices[..., :2].amax(1))[:, None] / 2
-    vertices[..., 2] -= torch.from_numpy(floor_height(vertices.numpy()))[:, None]
+    vertices[..., 2] -= vertices[..., 2].amin(-1)[:, None]
     # Seen from a little above, along x, from the height of a standing person's hips.
     cam_from_world = rotation_about("x", tilt) @ CAMERA_FROM_BODY
     hips, away = torch.tensor([0.0, 0.0, 0.95]), torch.tensor([0.0, 0.0, distance])

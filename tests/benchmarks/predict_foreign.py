@@ -49,7 +49,7 @@ def main() -> None:
 
     order = ORDERS["coco17"]
     index = [JOINT_INDEX[joint] for joint in order.joints]
-    rows = [[order.names.index(name) for name in taken.keypoints] for taken in order.joints.values()]
+    rows = [[order.names.index(name) for name in names] for names in order.joints.values()]
     truth = np.stack([coco[row].mean(0) for row in rows])
     columns = ("cloud to mesh, median", "95 %", f"MPJPE of {len(index)}: initial", "detector", "mesh")
     print(f"{'mm':24s}" + "".join(f"{column:>24s}" for column in columns))

@@ -8,7 +8,6 @@ from scipy.spatial.transform import Rotation
 from ljn.geometry.rotations import (
     BODY_TO_OPENGL,
     CAMERA_FROM_BODY,
-    body_world_pose_to_smpl,
     euler_to_rotmat,
     interpolate_rotmat,
     rot6d_to_rotmat,
@@ -158,13 +157,12 @@ def test_a_body_at_rest_in_smpl_axes_stands_along_z_and_faces_x_in_body_world():
     torch.testing.assert_close(root @ forward, torch.tensor([1.0, 0.0, 0.0], dtype=DTYPE))
 
 
-def test_pose_frames_turn_the_root_from_the_left_and_back_and_touch_nothing_else():
+def test_pose_frames_turn_the_root_from_the_left_and_touch_nothing_else():
     pose = 0.8 * torch.randn(4, 5, 72, dtype=DTYPE, generator=torch.Generator().manual_seed(1))
     world = smpl_pose_to_body_world(pose)
     expected = BODY_TO_OPENGL.T @ rotvec_to_rotmat(pose[..., :3])
     torch.testing.assert_close(rotvec_to_rotmat(world[..., :3]), expected)
     assert torch.equal(world[..., 3:], pose[..., 3:])
-    torch.testing.assert_close(body_world_pose_to_smpl(world), pose)
     assert smpl_pose_to_body_world(pose.float()).dtype == torch.float32
 
 

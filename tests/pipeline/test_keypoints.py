@@ -15,8 +15,8 @@ def in_order(truth, name):
     """What a perfect detector of an order would give, `(K, 2)`; (0, 0) for what no SMPL joint is taken from."""
     order = ORDERS[name]
     given = np.zeros((len(order.names), 2))
-    for joint, taken in order.joints.items():
-        for keypoint in taken.keypoints:
+    for joint, keypoints in order.joints.items():
+        for keypoint in keypoints:
             given[order.names.index(keypoint)] = truth[JOINT_INDEX[joint]]
     return given
 
@@ -39,10 +39,10 @@ def test_orders_are_told_apart_and_whole(name, truth):
     for form in (given.tolist(), {"order": name, "keypoints": given}, as_names):
         np.testing.assert_array_equal(smpl_keypoints(form).positions, expected)
     assert len(set(ORDERS[name].names)) == len(ORDERS[name].names)
-    for joint, taken in ORDERS[name].joints.items():
+    for joint, keypoints in ORDERS[name].joints.items():
         assert joint in JOINT_NAMES
-        assert set(taken.keypoints) <= set(ORDERS[name].names)
-        sides = {keypoint[0].lower() for keypoint in taken.keypoints}
+        assert set(keypoints) <= set(ORDERS[name].names)
+        sides = {keypoint[0].lower() for keypoint in keypoints}
         assert joint == "head" or joint[0] in sides or not joint.startswith(("l_", "r_"))
 
 

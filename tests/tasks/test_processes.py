@@ -179,11 +179,11 @@ def test_only_a_job_of_a_sweep_on_several_gpus_claims_one(monkeypatch):
     trainer = {"devices": 1, "accelerator": "auto"}
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
     monkeypatch.setattr(processes, "claim_gpu", lambda count: count - 1)
-    assert processes.own_devices(trainer) == {}
+    assert processes.unclaimed_devices(trainer) == {}
     monkeypatch.setattr(processes, "is_job_of_sweep", lambda: True)
-    assert processes.own_devices(trainer) == {"devices": [1]}
-    assert processes.own_devices(trainer | {"accelerator": "cpu"}) == {}
-    assert processes.own_devices(trainer | {"devices": [0]}) == {}
+    assert processes.unclaimed_devices(trainer) == {"devices": [1]}
+    assert processes.unclaimed_devices(trainer | {"accelerator": "cpu"}) == {}
+    assert processes.unclaimed_devices(trainer | {"devices": [0]}) == {}
 
 
 @pytest.fixture(scope="module")

@@ -14,15 +14,10 @@ from ljn.geometry.rotations import euler_to_rotmat, rotation_about
 
 
 class Goal(NamedTuple):
-    """A normal distribution of wrist positions: left arm, from the shoulder, chest's axes, in arm lengths.
+    """A normal distribution of wrist positions: left arm, from the shoulder, chest's axes, in arm lengths."""
 
-    Attributes:
-        mean: To the left, up, forward.
-        deviation: Standard deviations.
-    """
-
-    mean: tuple[float, float, float]
-    deviation: tuple[float, float, float]
+    mean: tuple[float, float, float]  # to the left, up, forward
+    deviation: tuple[float, float, float]  # standard deviation along each
 
 
 GOALS: dict[str, Goal] = {
@@ -53,11 +48,8 @@ _MAX_FLEXION_DEG, _MIN_FLEXION_DEG = 148.0, 4.0
 def draw_targets(rng: np.random.Generator, goals: np.ndarray, swing: np.ndarray, drop: np.ndarray) -> Tensor:
     """Wrist positions, to the side, up and forward of the shoulder: `(n, 2, 3)`, arm lengths, left arm first.
 
-    Args:
-        rng: Source of the draws.
-        goals: `(n, 2)`, indices into `GOALS`.
-        swing: `(n,)`, how far the left arm swings forward and the right one back, arm lengths.
-        drop: `(n,)`, degrees, how far all is turned downwards in the end.
+    Drawn about `goals` `(n, 2)`, indices into `GOALS`; the left arm swings forward and the right one back by `swing`
+    `(n,)`, arm lengths; then all is turned downwards by `drop` `(n,)`, degrees.
     """
     mean = np.array([goal.mean for goal in GOALS.values()])[goals]
     deviation = np.array([goal.deviation for goal in GOALS.values()])[goals]
@@ -137,13 +129,11 @@ def reach(
     to_elbow = to_elbow.expand_as(to_wrist)
     # In the hinge's plane: the angle between the bones by the law of cosines, less what it is at rest.
     flat_elbow, flat_wrist = (torch.hypot(bone[..., 0], bone[..., 2]) for bone in (to_elbow, to_wrist))
-    at_rest = torch.atan2(to_wrist[..., 0], to_wrist[..., 2]) - torch.atan2(
-        to_elbow[..., 0], to_elbow[..., 2]
-    )
+    elbow_turn, wrist_turn = (torch.atan2(bone[..., 0], bone[..., 2]) for bone in (to_elbow, to_wrist))
+    at_rest = wrist_turn - elbow_turn
     along_hinge = to_elbow[..., 1] + to_wrist[..., 1]
-    cosine = (target.square().sum(-1) - along_hinge**2 - flat_elbow**2 - flat_wrist**2) / (
-        2 * flat_elbow * flat_wrist
-    )
+    across = target.square().sum(-1) - along_hinge**2
+    cosine = (across - flat_elbow**2 - flat_wrist**2) / (2 * flat_elbow * flat_wrist)
     narrowest, widest = (math.cos(math.radians(degrees)) for degrees in (_MAX_FLEXION_DEG, _MIN_FLEXION_DEG))
     flexion = cosine.clamp(narrowest, widest).acos()
     hinge = rotation_about("y", -sign * flexion - at_rest)

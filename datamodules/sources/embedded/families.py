@@ -64,6 +64,11 @@ def _stride(draw: Draw, stretch: float, knee_lift: float) -> dict[str, np.ndarra
     }
 
 
+def _swapped(is_swapped: np.ndarray, *values: np.ndarray) -> list[np.ndarray]:
+    """Values of two legs `(n, 2)`, those of the left and the right one swapped where `(n,)` says so."""
+    return [np.where(is_swapped[:, None], legs[:, ::-1], legs) for legs in values]
+
+
 def walk(draw: Draw) -> Posture:
     """A step at any speed."""
     return Posture(
@@ -122,8 +127,7 @@ def lunge(draw: Draw) -> Posture:
     knee[:, 1] *= np.where(is_sideways, 0.3, 1.0)
     spread = 3 + draw.half_normal(10, 2)
     spread[:, 1] += is_sideways * draw.uniform(10, 40)
-    is_swapped = draw.chance(0.5)[:, None]
-    thigh, knee, spread = (np.where(is_swapped, legs[:, ::-1], legs) for legs in (thigh, knee, spread))
+    thigh, knee, spread = _swapped(draw.chance(0.5), thigh, knee, spread)
     return Posture(
         thigh=thigh,
         knee=knee,
@@ -178,9 +182,7 @@ def kick(draw: Draw) -> Posture:
     foot = np.stack([np.zeros(draw.n), raised - bent - 35 + draw.normal(20)], 1)
     roll = is_sideways * -draw.uniform(0, 25)
     is_swapped = draw.chance(0.5)
-    thigh, knee, spread, foot = (
-        np.where(is_swapped[:, None], legs[:, ::-1], legs) for legs in (thigh, knee, spread, foot)
-    )
+    thigh, knee, spread, foot = _swapped(is_swapped, thigh, knee, spread, foot)
     roll = np.where(is_swapped, -roll, roll)
     return Posture(
         thigh=thigh,
@@ -278,23 +280,19 @@ def dance(draw: Draw) -> Posture:
     standing = draw.half_normal(6) + draw.chance(0.25) * draw.uniform(0, 50)
     forward = np.where(is_behind, -0.75 * raised, np.where(is_sideways, draw.normal(15), raised))
     folded = draw.chance(0.35) * draw.uniform(20, 120) + draw.half_normal(6)
-    thigh = np.stack(
-        [np.where(is_bent, 0.5 * plie, 0.5 * standing), np.where(is_bent, 0.5 * plie, forward)], 1
-    )
+    half = 0.5 * plie
+    thigh = np.stack([np.where(is_bent, half, 0.5 * standing), np.where(is_bent, half, forward)], 1)
     knee = np.stack([np.where(is_bent, plie, standing), np.where(is_bent, plie, folded)], 1)
     open_legs = is_bent * (6 + 0.35 * plie)
-    spread = np.stack([open_legs, np.where(is_sideways, 0.85 * raised, open_legs)], 1) + draw.half_normal(
-        6, 2
-    )
+    spread = np.stack([open_legs, np.where(is_sideways, 0.85 * raised, open_legs)], 1)
+    spread = spread + draw.half_normal(6, 2)
     # Pointed toes, or a level foot under the weight, up on its ball half the time.
     level = draw.chance(0.4) * draw.uniform(-50, 0)
     foot = np.stack([level, np.where(is_bent, level, thigh[:, 1] - knee[:, 1] - 45)], 1)
     pitch = draw.normal(5) + np.where(is_behind, 0.55 * raised, np.where(is_bent, 0.0, -0.1 * raised))
     roll = -is_sideways.astype(float) * draw.uniform(0, 0.35) * raised
     is_swapped = draw.chance(0.5)
-    thigh, knee, spread, foot = (
-        np.where(is_swapped[:, None], legs[:, ::-1], legs) for legs in (thigh, knee, spread, foot)
-    )
+    thigh, knee, spread, foot = _swapped(is_swapped, thigh, knee, spread, foot)
     return Posture(
         thigh=thigh,
         knee=knee,

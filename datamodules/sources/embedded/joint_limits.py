@@ -17,24 +17,13 @@ from torch import Tensor
 
 from ljn.body.kinematics import SIDES
 from ljn.body.skeleton import JOINT_INDEX
-from ljn.geometry.rotations import (
-    euler_to_rotmat,
-    rotmat_to_euler,
-    rotvec_to_rotmat,
-    swing_twist,
-)
+from ljn.geometry.rotations import euler_to_rotmat, rotmat_to_euler, rotvec_to_rotmat, swing_twist
 
 
 class Ranges(NamedTuple):
-    """Limits of three angles, degrees, for the left side or the middle; the right side mirrors them.
+    """Limits of three angles, degrees, for the left side or the middle; the right side mirrors them."""
 
-    Attributes:
-        axes: The axes in the order of the product, see `euler_to_rotmat`.
-        low: Lower ends.
-        high: Upper ends.
-    """
-
-    axes: str
+    axes: str  # the axes in the order of the product, see `euler_to_rotmat`
     low: tuple[float, float, float]
     high: tuple[float, float, float]
 
@@ -64,8 +53,6 @@ RANGES: dict[str, Ranges] = {
     #                            flexion  carrying  forearm's turn
     "elbow": Ranges(ELBOW_AXES, (-150.0, -12.0, -85.0), (5.0, 12.0, 85.0)),
 }
-HINGES: tuple[str, ...] = ("knee", "elbow")
-
 SHOULDER_BACK_DEG = 60.0
 """How far an arm points behind the plane of the chest: extension of 60 degrees with the arm down."""
 SHOULDER_ACROSS_DEG = 50.0
@@ -83,12 +70,9 @@ def _joints(kind: str) -> list[tuple[int, int]]:
 
 
 def _limits_of_side(ranges: Ranges, sign: int) -> tuple[list[float], list[float]]:
-    bounds = [
-        (low, high) if axis == "x" or sign > 0 else (-high, -low)
-        for axis, low, high in zip(ranges.axes, ranges.low, ranges.high)
-    ]
-    low, high = zip(*bounds)
-    return list(low), list(high)
+    bounds = zip(ranges.axes, ranges.low, ranges.high)
+    turned = [(low, high) if axis == "x" or sign > 0 else (-high, -low) for axis, low, high in bounds]
+    return [low for low, _ in turned], [high for _, high in turned]
 
 
 class _Group(NamedTuple):
@@ -109,10 +93,9 @@ def _grouped() -> list[_Group]:
             if ranges.axes == axes
             for joint, sign in _joints(kind)
         ]
-        low, high = (
-            torch.tensor([row[end] for row in rows], dtype=torch.float64).deg2rad() for end in (1, 2)
-        )
-        groups.append(_Group(axes, [row[0] for row in rows], low, high))
+        joints, *limits = (list(column) for column in zip(*rows))
+        low, high = (torch.tensor(limit, dtype=torch.float64).deg2rad() for limit in limits)
+        groups.append(_Group(axes, joints, low, high))
     return groups
 
 
@@ -120,14 +103,7 @@ _GROUPS = _grouped()
 
 
 def within_limits(rotmat: Tensor) -> Tensor:
-    """Poses held within the ranges of motion; joints that are within them stay as they are, to the last bit.
-
-    Args:
-        rotmat: `(n, 24, 3, 3)`.
-
-    Returns:
-        `(n, 24, 3, 3)`.
-    """
+    """Poses `(n, 24, 3, 3)` held within the ranges of motion; joints within them stay, to the last bit."""
     result = rotmat.clone()
     for axes, joints, low, high in _GROUPS:
         angles = rotmat_to_euler(axes, rotmat[:, joints])
@@ -140,7 +116,7 @@ def within_limits(rotmat: Tensor) -> Tensor:
 
 
 def _shoulder_within_limits(rotmat: Tensor, sign: int) -> Tensor:
-    """One shoulder's rotations `(n, 3, 3)` with the upper arm led back to where arms point, and its twist held."""
+    """One shoulder's rotations `(n, 3, 3)` with the upper arm's direction and its twist held within limits."""
     arm = torch.tensor([float(sign), 0.0, 0.0], dtype=rotmat.dtype)
     swing, twist = swing_twist(rotmat, arm)
     inward = sign * twist
@@ -174,17 +150,11 @@ def _outside_cap(direction: Tensor, pole: Tensor, limit_deg: float) -> tuple[Ten
 
 
 def with_square_elbows(rotmat: Tensor) -> Tensor:
-    """Poses whose elbows bend about their hinge, every joint where it was.
+    """Poses `(n, 24, 3, 3)` whose elbows bend about their hinge, every joint where it was.
 
     Motion capture leaves open how far an upper arm is turned about itself, and files differ in where they put an
     elbow's axis. The sideways part of a bent elbow is handed on to the shoulder as twist: forearm and hand keep their
     places and directions. Below 5 degrees of flexion an elbow's plane says nothing; above 20 all is handed on.
-
-    Args:
-        rotmat: `(n, 24, 3, 3)`.
-
-    Returns:
-        `(n, 24, 3, 3)`.
     """
     result = rotmat.clone()
     for side, sign in SIDES.items():

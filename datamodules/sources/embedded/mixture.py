@@ -11,13 +11,7 @@ from datamodules.sources.embedded.families import FAMILIES
 from datamodules.sources.embedded.joint_limits import within_limits
 from datamodules.sources.embedded.penetration import fit_capsules, penetration
 from datamodules.sources.embedded.procedural import draw_poses
-from datamodules.sources.embedded.recombination import (
-    Donors,
-    Made,
-    jittered,
-    swapped_poses,
-    whole_poses,
-)
+from datamodules.sources.embedded.recombination import Donors, Made, jittered, swapped_poses, whole_poses
 from datamodules.sources.embedded.reference import REFERENCE_CAPSULES, REFERENCE_OFFSETS
 from ljn.body import BodyModel
 from ljn.body.kinematics import joint_offsets, without_heading, world_rotations
@@ -52,8 +46,7 @@ class MixtureSettings:
 
     def __post_init__(self) -> None:
         for name, shares, known in (("shares", self.shares, KINDS), ("families", self.families, FAMILIES)):
-            unknown = sorted(set(shares) - set(known))
-            if unknown or min(shares.values(), default=0) < 0 or sum(shares.values()) <= 0:
+            if set(shares) - set(known) or min(shares.values(), default=0) < 0 or sum(shares.values()) <= 0:
                 raise ValueError(
                     f"{name}: expected numbers of 0 or more, not all 0, for some of {', '.join(known)}; got "
                     f"{dict(shares)}"
@@ -67,14 +60,7 @@ class MixtureSettings:
 
 
 class PoseMixture:
-    """Draws poses of a mixture.
-
-    Args:
-        settings: What it is made of.
-        donors: Frames of clips.
-        body: The body whose arms reach for their targets and that poses are kept clear on, beside the reference
-            skeleton.
-    """
+    """Draws poses of a mixture of frames of clips and families, clear on a body and the reference skeleton."""
 
     def __init__(self, settings: MixtureSettings, donors: Donors, body: BodyModel) -> None:
         self.settings = settings
@@ -82,10 +68,10 @@ class PoseMixture:
         self._offsets = joint_offsets(body)
         self._capsules = fit_capsules(body)
         families, kinds = _normalised(settings.families, FAMILIES), _normalised(settings.shares, KINDS)
-        procedural = kinds.pop("procedural", 0.0)
-        self._families = {f"{_PROCEDURAL}{name}": share for name, share in families.items()}
+        share = kinds.pop("procedural", 0.0)
+        self._families = {f"{_PROCEDURAL}{name}": of_family for name, of_family in families.items()}
         self.labels = kinds | {
-            label: procedural * share for label, share in self._families.items() if procedural
+            label: share * of_family for label, of_family in self._families.items() if share
         }
 
     def draw(self, rng: np.random.Generator, n: int) -> Made:
@@ -127,20 +113,15 @@ class PoseMixture:
         """Poses of the kinds or families that `labels` `(n,)` name, within joint limits, not yet tested."""
         n = len(labels)
         result = Made(
-            torch.empty(n, NUM_JOINTS, 3, 3, dtype=torch.float64),
-            np.empty(n, object),
-            np.empty(n, np.int64),
+            torch.empty(n, NUM_JOINTS, 3, 3, dtype=torch.float64), np.empty(n, object), np.empty(n, np.int64)
         )
         is_procedural = np.char.startswith(labels, _PROCEDURAL)
         for kind in KINDS:
             rows = np.flatnonzero(is_procedural if kind == "procedural" else labels == kind)
-            if len(rows):
-                made = (
-                    self._draw_families(rng, labels[rows])
-                    if kind == "procedural"
-                    else self._make(rng, kind, len(rows))
-                )
-                _put(result, rows, made)
+            if len(rows) and kind == "procedural":
+                _put(result, rows, self._draw_families(rng, labels[rows]))
+            elif len(rows):
+                _put(result, rows, self._make(rng, kind, len(rows)))
         return result._replace(rotmat=within_limits(result.rotmat))
 
     def _make(self, rng: np.random.Generator, kind: str, n: int) -> Made:
@@ -172,6 +153,6 @@ def _put(poses: Made, rows: np.ndarray, others: Made) -> None:
 
 
 def _normalised(shares: Mapping[str, float], known: Iterable[str]) -> dict[str, float]:
-    """Those of the shares that are not zero, summing to 1, in one order whatever order they were given in."""
+    """The shares that are not zero, normalised to a sum of 1, in the order of `known`."""
     total = sum(shares.values())
     return {name: shares[name] / total for name in known if shares.get(name, 0) > 0}

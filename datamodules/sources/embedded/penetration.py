@@ -14,23 +14,16 @@ from ljn.body.skeleton import JOINT_INDEX
 
 
 class _Part(NamedTuple):
-    """A stretch of the body for one capsule.
+    """A stretch of the body for one capsule."""
 
-    Attributes:
-        joint: The joint that moves it.
-        vertices_of: Joints whose vertices (by their largest blend weight) it covers.
-        towards: The joint that its axis points to, or a coordinate axis of the rest frame.
-        begins_at: Which share of its length, from the end at the joint, is left out.
-    """
-
-    joint: str
-    vertices_of: tuple[str, ...]
-    towards: str
-    begins_at: float = 0.0
+    joint: str  # the joint that moves it
+    vertices_of: tuple[str, ...]  # joints whose vertices (by their largest blend weight) it covers
+    towards: str  # the joint that its axis points to, or a coordinate axis of the rest frame
+    begins_at: float = 0.0  # which share of its length, from the end at the joint, is left out
 
 
 # The trunk is wider than deep: three capsules across, one above the other, fill it. An upper arm begins in the chest;
-# only its lower half can be told to be in the wrong place.
+# only its lower half can be detected in a wrong place.
 _PARTS = {
     "pelvis": _Part("pelvis", ("pelvis",), "x"),
     "waist": _Part("spine1", ("spine1",), "x"),
@@ -62,21 +55,13 @@ _MAY_TOUCH |= {("ribs", f"{side}_upper_arm") for side in SIDES}  # a hanging arm
 
 
 class Capsules(NamedTuple):
-    """Capsules that move with joints.
+    """Capsules that move with joints."""
 
-    Attributes:
-        names: P of them.
-        joints: `(P, 2)` long, the joints that move the two ends of each axis.
-        ends: `(P, 2, 3)`, metres, the ends relative to these joints, rest frame.
-        radii: `(P,)`, metres.
-        pairs: `(2, Q)` long, the pairs of capsules that should not meet.
-    """
-
-    names: tuple[str, ...]
-    joints: Tensor
-    ends: Tensor
-    radii: Tensor
-    pairs: Tensor
+    names: tuple[str, ...]  # `(P,)`
+    joints: Tensor  # `(P, 2)` long, the joints that move the two ends of each axis
+    ends: Tensor  # `(P, 2, 3)`, metres, the ends relative to these joints, rest frame
+    radii: Tensor  # `(P,)`, metres
+    pairs: Tensor  # `(2, Q)` long, the pairs of capsules that should not meet
 
 
 def fit_capsules(body: BodyModel) -> Capsules:
@@ -120,10 +105,8 @@ def fit_capsules(body: BodyModel) -> Capsules:
 
 def tested_pairs(names: Iterable[str], may_touch: Container[tuple[str, str]]) -> Tensor:
     """All pairs of capsules but those that `may_touch` names, earlier one first: `(2, Q)` long."""
-    pairs = [
-        (i, j) for (i, one), (j, other) in combinations(enumerate(names), 2) if (one, other) not in may_touch
-    ]
-    return torch.tensor(pairs).T
+    pairs = combinations(enumerate(names), 2)
+    return torch.tensor([(i, j) for (i, one), (j, other) in pairs if (one, other) not in may_touch]).T
 
 
 def penetration(world: Tensor, offsets: Tensor, capsules: Capsules) -> Tensor:
@@ -139,9 +122,7 @@ def penetration(world: Tensor, offsets: Tensor, capsules: Capsules) -> Tensor:
     """
     moved = (world[:, capsules.joints] * capsules.ends[..., None, :]).sum(-1)  # (n, P, 2, 3)
     ends = joint_positions(world, offsets)[:, capsules.joints] + moved
-    start, end = ends.permute(
-        2, 3, 0, 1
-    )  # (3, n, P) each: with coordinates outermost this takes half the time
+    start, end = ends.permute(2, 3, 0, 1)  # (3, n, P) each: coordinates outermost take half the time
     one, other = capsules.pairs
     distance = segment_distance(start[..., one], end[..., one], start[..., other], end[..., other])
     return capsules.radii[capsules.pairs].sum(0) - distance

@@ -9,12 +9,7 @@ from datamodules.sources.embedded.arms import GOALS
 
 
 class Draw:
-    """Random numbers for a family's `n` poses.
-
-    Args:
-        rng: Source of the draws.
-        n: Number of poses.
-    """
+    """Random numbers for a family's `n` poses."""
 
     def __init__(self, rng: np.random.Generator, n: int) -> None:
         self.rng = rng
@@ -57,38 +52,20 @@ class Draw:
 
 @dataclass
 class Posture:
-    """What a family decides: `n` poses, degrees, left before right.
+    """What a family decides: `n` poses, degrees, left before right."""
 
-    Attributes:
-        thigh: `(n, 2)`, forward of straight down; the hip flexes by this and the pelvis' pitch.
-        knee: `(n, 2)`, flexion.
-        goals: `(n, 2)`, indices into `GOALS`.
-        foot: `(n, 2)`, how far the toes are raised above level, legs that are spread and turned out left aside.
-        spread: `(n, 2)`, how far the legs are out of the vertical, to their sides.
-        turnout: `(n, 2)`, hips' outward rotation.
-        pitch: `(n,)`, of the pelvis, forward.
-        roll: `(n,)`, of the pelvis, to the right.
-        turn: `(n,)`, of the pelvis about the trunk's own axis, to the left: onto a side when lying.
-        bend: `(n,)`, of the spine, forward.
-        twist: `(n,)`, of the spine, to the left.
-        lean: `(n,)`, of the spine, to the right.
-        nod: `(n,)`, of head and neck, forward.
-        swing: `(n,)`, of the left arm, forward, arm lengths.
-        drop: `(n,)`, how far both hands' targets are turned downwards.
-    """
-
-    thigh: np.ndarray
-    knee: np.ndarray
-    goals: np.ndarray
-    foot: np.ndarray | float = 0.0
-    spread: np.ndarray | float = 0.0
-    turnout: np.ndarray | float = 0.0
-    pitch: np.ndarray | float = 0.0
-    roll: np.ndarray | float = 0.0
-    turn: np.ndarray | float = 0.0
-    bend: np.ndarray | float = 0.0
-    twist: np.ndarray | float = 0.0
-    lean: np.ndarray | float = 0.0
-    nod: np.ndarray | float = 0.0
-    swing: np.ndarray | float = 0.0
-    drop: np.ndarray | float = 0.0
+    thigh: np.ndarray  # `(n, 2)`, forward of straight down; the hip flexes by this and the pelvis' pitch
+    knee: np.ndarray  # `(n, 2)`, flexion
+    goals: np.ndarray  # `(n, 2)`, indices into `GOALS`
+    foot: np.ndarray | float = 0.0  # `(n, 2)`, how far toes are raised above level (without spread, turnout)
+    spread: np.ndarray | float = 0.0  # `(n, 2)`, how far the legs are out of the vertical, to their sides
+    turnout: np.ndarray | float = 0.0  # `(n, 2)`, hips' outward rotation
+    pitch: np.ndarray | float = 0.0  # `(n,)`, of the pelvis, forward
+    roll: np.ndarray | float = 0.0  # `(n,)`, of the pelvis, to the right
+    turn: np.ndarray | float = 0.0  # `(n,)`, of the pelvis about the trunk's axis, to the left
+    bend: np.ndarray | float = 0.0  # `(n,)`, of the spine, forward
+    twist: np.ndarray | float = 0.0  # `(n,)`, of the spine, to the left
+    lean: np.ndarray | float = 0.0  # `(n,)`, of the spine, to the right
+    nod: np.ndarray | float = 0.0  # `(n,)`, of head and neck, forward
+    swing: np.ndarray | float = 0.0  # `(n,)`, of the left arm, forward, arm lengths
+    drop: np.ndarray | float = 0.0  # `(n,)`, how far both hands' targets are turned downwards

@@ -9,7 +9,7 @@ from datamodules.sources.embedded.families import FAMILIES
 from datamodules.sources.embedded.joint_limits import LEG_AXES
 from datamodules.sources.embedded.posture import Draw, Posture
 from ljn.body.kinematics import SIDES
-from ljn.body.skeleton import JOINT_INDEX, NUM_JOINTS, ROOT
+from ljn.body.skeleton import JOINT_INDEX, NUM_JOINTS
 from ljn.geometry.rotations import euler_to_rotmat
 
 _SPINE_SHARES = {"spine1": 0.45, "spine2": 0.35, "spine3": 0.20}
@@ -19,16 +19,7 @@ _REST_SPREAD_DEG = 4.0
 
 
 def draw_poses(rng: np.random.Generator, families: np.ndarray, offsets: Tensor) -> Tensor:
-    """Poses of the families.
-
-    Args:
-        rng: Source of the draws.
-        families: `(n,)` str, keys of `FAMILIES`.
-        offsets: `(24, 3)`, metres, of the skeleton whose arms reach for their targets; see `joint_offsets`.
-
-    Returns:
-        `(n, 24, 3, 3)`, not yet held within joint limits.
-    """
+    """Poses `(n, 24, 3, 3)` of the families named `(n,)`, on a skeleton (`joint_offsets`), before joint limits."""
     n = len(families)
     angles = np.zeros((n, NUM_JOINTS, 3))
     goals = np.zeros((n, 2), np.int64)
@@ -49,17 +40,13 @@ def _joint_angles(posture: Posture, draw: Draw) -> np.ndarray:
     """Angles `(n, 24, 3)` about x, z and y, degrees, of all but the arms; feet and neck are drawn here."""
     angles = np.zeros((draw.n, NUM_JOINTS, 3))
 
-    def turn(joint: str, x: np.ndarray, z: np.ndarray | float, y: np.ndarray | float) -> None:
-        angles[:, JOINT_INDEX[joint], 0] = x
-        angles[:, JOINT_INDEX[joint], 1] = z
-        angles[:, JOINT_INDEX[joint], 2] = y
+    def turn(joint: str, *turns: np.ndarray | float) -> None:
+        for axis, angle in enumerate(turns):
+            angles[:, JOINT_INDEX[joint], axis] = angle
 
-    angles[:, ROOT] = np.stack(
-        [np.broadcast_to(angle, draw.n) for angle in (posture.pitch, posture.roll, posture.turn)], -1
-    )
-    spread, turnout, foot = (
-        np.broadcast_to(angle, (draw.n, 2)) for angle in (posture.spread, posture.turnout, posture.foot)
-    )
+    turn("pelvis", posture.pitch, posture.roll, posture.turn)
+    of_legs = (posture.spread, posture.turnout, posture.foot)
+    spread, turnout, foot = (np.broadcast_to(angle, (draw.n, 2)) for angle in of_legs)
     for leg, (side, sign) in enumerate(SIDES.items()):
         thigh, knee = posture.thigh[:, leg], posture.knee[:, leg].clip(0, 150)
         aside = sign * (spread[:, leg] - _REST_SPREAD_DEG)

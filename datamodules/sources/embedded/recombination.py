@@ -7,39 +7,24 @@ import torch
 from torch import Tensor
 
 from ljn.body.kinematics import SIDES, mirror, without_heading
-from ljn.body.skeleton import JOINT_INDEX, JOINT_NAMES, NUM_JOINTS, ROOT
+from ljn.body.skeleton import JOINT_INDEX, NUM_JOINTS, ROOT
 from ljn.geometry.rotations import interpolate_rotmat, rotvec_to_rotmat
 
-_LEG_NAMES = ("pelvis", "hip", "knee", "ankle", "foot")
-_TRUNK_NAMES = ("spine1", "spine2", "spine3", "neck", "head")
-
-
-def _joints_named(names: tuple[str, ...]) -> tuple[int, ...]:
-    return tuple(JOINT_INDEX[name] for name in JOINT_NAMES if name in names or name[2:] in names)
-
-
-LEGS, TRUNK = _joints_named(_LEG_NAMES), _joints_named(_TRUNK_NAMES)
+TRUNK = tuple(JOINT_INDEX[name] for name in ("spine1", "spine2", "spine3", "neck", "head"))
 LEFT_ARM, RIGHT_ARM = (
     tuple(JOINT_INDEX[f"{side}_{name}"] for name in ("collar", "shoulder", "elbow", "wrist", "hand"))
     for side in SIDES
 )
-"""The parts that change hands: legs with the pelvis, trunk with the head, arms with the collars."""
+"""The parts that are exchanged: trunk with the head, arms with the collars; what is left are the legs."""
 
 
 class Donors(NamedTuple):
-    """Poses to take from.
+    """Poses to take from."""
 
-    Attributes:
-        rotmat: `(M, 24, 3, 3)`, headings dropped.
-        name: `(M,)` str, where each comes from.
-        frame: `(M,)` int64, its frame there, -1 where there are no frames.
-        weight: `(M,)`, how often each is taken, summing to 1.
-    """
-
-    rotmat: Tensor
-    name: np.ndarray
-    frame: np.ndarray
-    weight: np.ndarray
+    rotmat: Tensor  # `(M, 24, 3, 3)`, headings dropped
+    name: np.ndarray  # `(M,)` str, where each comes from
+    frame: np.ndarray  # `(M,)` int64, its frame there, -1 where there are no frames
+    weight: np.ndarray  # `(M,)`, how often each is taken, summing to 1
 
     def draw(self, rng: np.random.Generator, n: int) -> np.ndarray:
         """`n` rows by their weights."""
@@ -48,17 +33,11 @@ class Donors(NamedTuple):
 
 
 class Made(NamedTuple):
-    """Poses made from donors.
+    """Poses made from donors."""
 
-    Attributes:
-        rotmat: `(n, 24, 3, 3)`.
-        name: `(n,)` str, the donors' names.
-        frame: `(n,)` int64, frame of the legs' donor.
-    """
-
-    rotmat: Tensor
-    name: np.ndarray
-    frame: np.ndarray
+    rotmat: Tensor  # `(n, 24, 3, 3)`
+    name: np.ndarray  # `(n,)` str, the donors' names
+    frame: np.ndarray  # `(n,)` int64, frame of the legs' donor
 
 
 def clip_donors(rotmat: Tensor, clip: np.ndarray) -> Donors:
@@ -91,16 +70,10 @@ def swapped_poses(
 ) -> Made:
     """Poses whose legs, trunk and arms come from different donors; the pelvis' pitch and roll come with the legs.
 
-    Args:
-        donors: Each part's donor comes from a random one of these tables.
-        blend_share: Share of the trunks and of the arms that lie between two donors: every joint is led by one random
-            amount from the first donor's rotation to the second's.
-        apart_share: Share of the poses whose arms have a donor each.
-        rng: Source of the draws.
-        n: Number of poses.
-
-    Returns:
-        The poses, named "legs|trunk|arms" or "legs|trunk|left arm|right arm", with "first+second" for a blended part.
+    Each part's donor comes from a random one of the tables. A share of the trunks and of the arms is blended: one
+    random amount leads every joint from the first donor's rotation to the second's. A share of the poses has arms that
+    are apart, of a donor each. Names are "legs|trunk|arms" or "legs|trunk|left arm|right arm", with "first+second" for
+    a blended part.
     """
     legs, trunk, left, right = (_draw_from(donors, rng, n) for _ in range(4))
     left, trunk = (_blended(part, _draw_from(donors, rng, n), blend_share, rng) for part in (left, trunk))
@@ -108,20 +81,15 @@ def swapped_poses(
     rotmat = legs.rotmat.clone()
     rotmat[:, list(TRUNK)] = trunk.rotmat[:, list(TRUNK)]
     rotmat[:, list(LEFT_ARM)] = left.rotmat[:, list(LEFT_ARM)]
-    rotmat[:, list(RIGHT_ARM)] = torch.where(
-        torch.from_numpy(is_apart)[:, None, None, None], right.rotmat, left.rotmat
-    )[:, list(RIGHT_ARM)]
-    names = [
-        "|".join([legs_name, trunk_name, left_name] + ([right_name] if apart else []))
-        for legs_name, trunk_name, left_name, right_name, apart in zip(
-            legs.name, trunk.name, left.name, right.name, is_apart
-        )
-    ]
+    arms = torch.where(torch.from_numpy(is_apart)[:, None, None, None], right.rotmat, left.rotmat)
+    rotmat[:, list(RIGHT_ARM)] = arms[:, list(RIGHT_ARM)]
+    parts = zip(legs.name, trunk.name, left.name, right.name)
+    names = ["|".join(names if apart else names[:3]) for names, apart in zip(parts, is_apart)]
     return Made(rotmat, np.array(names), legs.frame)
 
 
 def _blended(one: Made, other: Made, share: float, rng: np.random.Generator) -> Made:
-    """A `share` of the poses led a random part of the way to others."""
+    """Poses of which a `share` is interpolated, by a random amount, towards others."""
     rows = np.flatnonzero(rng.random(len(one.name)) < share)
     amount = torch.from_numpy(rng.random(len(rows)))[:, None]
     rotmat, name = one.rotmat.clone(), one.name.astype(object)
@@ -137,9 +105,8 @@ def _draw_from(tables: tuple[Donors, ...], rng: np.random.Generator, n: int) -> 
     for index, table in enumerate(tables[1:], 1):
         made, is_from = whole_poses(table, rng, n), which == index
         rotmat = torch.where(torch.from_numpy(is_from)[:, None, None, None], made.rotmat, result.rotmat)
-        result = Made(
-            rotmat, np.where(is_from, made.name, result.name), np.where(is_from, made.frame, result.frame)
-        )
+        name, frame = np.where(is_from, made.name, result.name), np.where(is_from, made.frame, result.frame)
+        result = Made(rotmat, name, frame)
     return result
 
 
@@ -152,13 +119,9 @@ for _side in SIDES:
 
 
 def jittered(rotmat: Tensor, jitter_deg: float, rng: np.random.Generator) -> Tensor:
-    """Poses `(n, 24, 3, 3)` with every joint but the root turned a little.
+    """Poses `(n, 24, 3, 3)` with every joint but the root turned by a standard deviation about each axis, degrees.
 
-    Args:
-        rotmat: `(n, 24, 3, 3)`.
-        jitter_deg: Standard deviation about each axis, degrees; half of that and less about the axes that a knee or an
-            elbow does not bend about.
-        rng: Source of the draws.
+    By half of that and less about the axes that a knee or an elbow does not bend about.
     """
     turn = np.deg2rad(jitter_deg) * _JITTER * rng.standard_normal((len(rotmat), NUM_JOINTS, 3))
     return rotmat @ rotvec_to_rotmat(torch.from_numpy(turn))

@@ -23,19 +23,13 @@ _DECIMALS = 5  # radians; turns the farthest vertex by 0.02 mm
 
 
 class ClipMixture:
-    """Records of any clips, split by clip.
+    """Records of any clips, split by clip, posed on one body, whatever bodies are rendered in them.
+
+    Shape coefficients are standard normal, drawn again where they exceed `max_beta`; genders are drawn equally often.
 
     They come in batches with streams of their own, so a longer request begins with the records of a shorter one. All
     is computed in float64 and poses are rounded to 1e-5 radians: machines whose sines differ in the last bit still
     give equal records and an equal `PoseRecords.hash`, but for the rare value that lies just between two steps.
-
-    Args:
-        clips: The clips.
-        split: Names of the clips of each of `SPLITS`.
-        settings: How they are mixed.
-        body: The body that poses are made on, whatever bodies wear them.
-        max_beta: Shape coefficients are standard normal, drawn again where they exceed this.
-        genders: Genders to draw from, keys of `ljn.body.GENDERS`, each equally often.
     """
 
     def __init__(

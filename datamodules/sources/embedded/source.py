@@ -43,11 +43,7 @@ class EmbeddedSource:
         path: The file of clips; the embedded one by default. `.npz` with `poses` `(N, 72)` in SMPL's rest
             frame (y up, z forward) and `clip` `(N,)` names.
         split_path: JSON file of clip names by split; see `read_split`.
-        shares: See `MixtureSettings`.
-        families: See `MixtureSettings`.
-        blend_share: See `MixtureSettings`.
-        apart_share: See `MixtureSettings`.
-        max_penetration_m: See `MixtureSettings`.
+        shares, families, blend_share, apart_share, max_penetration_m: See `MixtureSettings`.
     """
 
     name = "embedded"
@@ -74,14 +70,8 @@ class EmbeddedSource:
             raise ValueError(f"max_beta: expected more than 0, got {max_beta}")
         if not genders or set(genders) - set(GENDERS):
             raise ValueError(f"genders: expected some of {', '.join(GENDERS)}, got {list(genders)}")
-        self.settings = MixtureSettings(
-            shares=dict(shares),
-            families=dict(families),
-            blend_share=blend_share,
-            apart_share=apart_share,
-            jitter_deg=jitter_deg,
-            max_penetration_m=max_penetration_m,
-        )
+        numbers = (blend_share, apart_share, jitter_deg, max_penetration_m)
+        self.settings = MixtureSettings(dict(shares), dict(families), *numbers)
         self.max_beta = max_beta
         self.genders = tuple(genders)
         self.path = Path(path or _DATA / "seed_poses.npz")
@@ -97,12 +87,8 @@ class EmbeddedSource:
     @property
     def fingerprint(self) -> str:
         """See `PoseSource.fingerprint`."""
-        settings = asdict(self.settings) | {
-            "version": self.version,
-            "body": self._body.hash,
-            "max_beta": self.max_beta,
-            "genders": self.genders,
-        }
+        shapes = {"body": self._body.hash, "max_beta": self.max_beta, "genders": self.genders}
+        settings = asdict(self.settings) | {"version": self.version, **shapes}
         digest = hashlib.sha256(self.path.read_bytes() + self.split_path.read_bytes())
         digest.update(json.dumps(settings, sort_keys=True).encode())
         return digest.hexdigest()[:16]
@@ -117,7 +103,7 @@ class EmbeddedSource:
 
     @cached_property
     def _body(self) -> BodyModel:
-        """Whatever bodies the poses are worn by, they are made on one."""
+        """The one body that poses are made on, whatever bodies are rendered in them."""
         return load_body_model()
 
     @cached_property

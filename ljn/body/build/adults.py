@@ -23,14 +23,10 @@ ATTRIBUTES: dict[str, tuple[str, ...]] = {
 
 
 def blend_weights(keys: list[tuple[str, ...]], adults: Adults) -> Array:
-    """How much of each target an adult gets: the product of its attributes' interpolation weights.
+    """How much of each target an adult gets, `(n, T)`: the product of its attributes' interpolation weights.
 
-    Args:
-        keys: T targets, each by the attribute values that it belongs to.
-        adults: n adults.
-
-    Returns:
-        `(n, T)`, at least 0; of a family that has a target for every combination of values they sum to 1.
+    Targets are named by the attribute values that they belong to; the weights of a family that has a target for every
+    combination of values sum to 1.
     """
     shares: dict[str, Array] = {}
     for attribute, names in ATTRIBUTES.items():
@@ -50,20 +46,12 @@ def average_adult() -> Adults:
 
 
 def sample_adults(rng: np.random.Generator, count: int, gender: str) -> Adults:
-    """Random adults.
+    """Random adults of a gender; `neutral` is every mixture of the two with equal chance.
 
     Heights are set to a stature of about 1.74 +- 0.08 m (men) and 1.63 +- 0.08 m (women), weight and muscle to a
-    BMI of about 23.5 +- 4: MakeHuman's attributes themselves say nothing about how frequent they are.
-
-    Args:
-        rng: Where the randomness comes from.
-        count: n.
-        gender: `male`, `female`, or `neutral`: every mixture of the two with equal chance. Men and women alone
-            would give two heaps instead, between and beyond which the components of a PCA make up bodies
-            that nobody has, such as caved-in chests.
-
-    Returns:
-        n adults.
+    BMI of about 23.5 +- 4: MakeHuman's attributes themselves say nothing about how frequent they are. Men and women
+    alone would give two heaps for `neutral`, between and beyond which the components of a PCA make up bodies that
+    nobody has, such as caved-in chests.
     """
     if gender == "neutral":
         sex = rng.uniform(0, 1, count)

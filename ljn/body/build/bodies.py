@@ -33,19 +33,12 @@ half precision up to 62 mm."""
 
 @dataclass(frozen=True)
 class Source:
-    """What all bodies share.
-
-    Attributes:
-        makehuman: The files' content.
-        topology: The decimated mesh, of indices into `rows`.
-        rows: `(V,)`, the mesh's vertices among all of MakeHuman's.
-        weights: `(V, 24)`, skinning weights.
-    """
+    """What all bodies share."""
 
     makehuman: MakeHuman
-    topology: Topology
-    rows: NDArray[np.int64]
-    weights: Array
+    topology: Topology  # the decimated mesh, of indices into `rows`
+    rows: NDArray[np.int64]  # `(V,)`, the mesh's vertices among all of MakeHuman's
+    weights: Array  # `(V, 24)`, skinning weights
 
 
 def read_source(folder: Path) -> Source:
@@ -66,17 +59,9 @@ def read_source(folder: Path) -> Source:
 def build_body(
     source: Source, gender: str, seed: int = 0, count: int = 600, log: Callable[[str], None] = print
 ) -> dict[str, NDArray[np.generic]]:
-    """One body in SMPL's format.
+    """The arrays of one body file in SMPL's format, exactly left-right symmetric.
 
-    Args:
-        source: See `read_source`.
-        gender: `neutral`, `male` or `female`.
-        seed: Of the sampled adults and poses.
-        count: How many adults to sample; four in five are fitted, the others measure the fit.
-        log: Takes lines of measurements.
-
-    Returns:
-        The arrays of a body file, exactly left-right symmetric.
+    Of `count` sampled adults, four in five are fitted; the others measure the fit, in lines for `log`.
     """
     topology, weights = source.topology, source.weights
     mirror, faces = topology.mirror, topology.faces
@@ -129,17 +114,14 @@ def _log_fit(
     betas = fit_betas(bodies, mean, components, source.topology.faces)
     fitted = mean + np.einsum("vdk,nk->nvd", components, betas)
     error = 1000 * np.linalg.norm(fitted - bodies, axis=-1)
+    mean_distance = 1000 * float(np.linalg.norm(bodies - mean, axis=-1).mean())
     joint_error = 1000 * np.linalg.norm(np.einsum("jv,nvd->njd", regressor, bodies) - joints, axis=-1)
     log(
         f"{gender}, {len(bodies)} adults held out: 10 betas {error.mean():.2f} mm from the surface (95 %: "
-        f"{np.percentile(error, 95):.1f} mm; the mean body {_mean_distance(bodies, mean):.1f} mm), joint regressor "
+        f"{np.percentile(error, 95):.1f} mm; the mean body {mean_distance:.1f} mm), joint regressor "
         f"{joint_error.mean():.2f} mm from the joints (worst {joint_error.mean(0).max():.2f} mm), "
         f"{(regressor > 0).sum() / NUM_JOINTS:.0f} vertices a joint"
     )
-
-
-def _mean_distance(bodies: Array, mean: Array) -> float:
-    return 1000 * float(np.linalg.norm(bodies - mean, axis=-1).mean())
 
 
 def save_body(arrays: dict[str, NDArray[np.generic]], path: Path) -> None:

@@ -111,13 +111,9 @@ class DeltaMush:
         )
 
     def _frames(self, vertices: Array) -> Array:
-        normals: Array = np.stack(
-            [
-                np.bincount(self._faces.ravel(), np.repeat(part, 3), minlength=len(vertices))
-                for part in face_normals(vertices, self._faces).T
-            ],
-            axis=-1,
-        )
+        corners, parts = self._faces.ravel(), face_normals(vertices, self._faces).T
+        sums = [np.bincount(corners, np.repeat(part, 3), minlength=len(vertices)) for part in parts]
+        normals: Array = np.stack(sums, axis=-1)
         normals /= np.linalg.norm(normals, axis=1, keepdims=True)
         tangents = vertices[self._neighbour] - vertices
         tangents -= (tangents * normals).sum(1, keepdims=True) * normals
@@ -128,13 +124,7 @@ class DeltaMush:
 def target_skinning(
     template: Array, weights: Array, joints: Array, topology: Topology
 ) -> Callable[[Array], tuple[Array, tuple[Array, Array]]]:
-    """The skinning that the correctives imitate.
-
-    Args:
-        template: `(V, 3)`, metres, T-pose.
-        weights: `(V, 24)`.
-        joints: `(24, 3)`, metres.
-        topology: The mesh.
+    """The skinning that the correctives imitate, of a template `(V, 3)` in T-pose and joints `(24, 3)`, metres.
 
     Returns:
         A function of relative rotations `(24, 3, 3)`: the posed vertices `(V, 3)`, and linear skinning's
@@ -164,16 +154,7 @@ def fit_posedirs(
 ) -> Array:
     """Offsets that bring linear skinning nearest to `target_skinning` over random poses, exactly symmetric.
 
-    Args:
-        template: `(V, 3)`, metres, T-pose.
-        weights: `(V, 24)`.
-        joints: `(24, 3)`, metres.
-        topology: The mesh.
-        rng: Where the poses come from.
-        count: How many poses.
-
-    Returns:
-        `(V, 3, 207)`, metres for a unit of each entry of R_1 - I ... R_23 - I.
+    `(V, 3, 207)`, metres for a unit of each entry of R_1 - I ... R_23 - I.
     """
     skin = target_skinning(template, weights, joints, topology)
     left = np.flatnonzero(np.arange(len(template)) <= topology.mirror)

@@ -32,24 +32,16 @@ _LIMB_BONES = {
 }  # fmt: skip
 
 _CUBES: dict[str, dict[str, float]] = {
-    "pelvis": {"joint-pelvis": 0.3, "joint-spine-4": 0.7},
-    "spine1": {"joint-spine-3": 1.0},
-    "spine2": {"joint-spine-2": 1.0},
-    "spine3": {"joint-spine-1": 1.0},
-    "neck": {"joint-neck": 1.0},
+    "pelvis": {"joint-pelvis": 0.3, "joint-spine-4": 0.7}, "spine1": {"joint-spine-3": 1.0},
+    "spine2": {"joint-spine-2": 1.0}, "spine3": {"joint-spine-1": 1.0}, "neck": {"joint-neck": 1.0},
     "head": {"joint-head": 1.0},
-}
+}  # fmt: skip
 _LIMB_CUBES: dict[str, dict[str, float]] = {
-    "hip": {"upper-leg": 1.0},
-    "knee": {"knee": 1.0},
-    "ankle": {"ankle": 1.0},
-    "foot": {f"toe-{i}-1": 0.2 for i in range(1, 6)},
-    "collar": {"clavicle": 0.5, "scapula": 0.5},
-    "shoulder": {"shoulder": 1.0},
-    "elbow": {"elbow": 1.0},
-    "wrist": {"hand": 1.0},
+    "hip": {"upper-leg": 1.0}, "knee": {"knee": 1.0}, "ankle": {"ankle": 1.0},
+    "foot": {f"toe-{i}-1": 0.2 for i in range(1, 6)}, "collar": {"clavicle": 0.5, "scapula": 0.5},
+    "shoulder": {"shoulder": 1.0}, "elbow": {"elbow": 1.0}, "wrist": {"hand": 1.0},
     "hand": {f"finger-{i}-1": 0.25 for i in range(2, 6)},
-}
+}  # fmt: skip
 """Joints as means of the small cubes that mark MakeHuman's joints."""
 
 
@@ -68,20 +60,13 @@ def joint_of_bone(bone: str) -> int:
 
 @dataclass(frozen=True)
 class MakeHuman:
-    """The base mesh with everything that deforms it.
+    """The base mesh with everything that deforms it."""
 
-    Attributes:
-        vertices: `(N, 3)`, metres, the base shape with its helper geometry.
-        body_faces: The body's polygons, three or four vertex indices each; closed, genus 0.
-        cubes: `(24, N)`, SMPL's joints as weighted means of helper vertices.
-        weights: `(N, 24)`, skinning weights, merged to SMPL's joints; rows of helpers are zero.
-        targets: Blend shapes by the attribute values they belong to: vertex indices and offsets in metres.
-    """
-
-    vertices: Array
-    body_faces: list[list[int]]
-    cubes: Array
-    weights: Array
+    vertices: Array  # `(N, 3)`, metres, the base shape with its helper geometry
+    body_faces: list[list[int]]  # the body's polygons, three or four vertex indices each; closed, genus 0
+    cubes: Array  # `(24, N)`, SMPL's joints as weighted means of helper vertices
+    weights: Array  # `(N, 24)`, skinning weights, merged to SMPL's joints; rows of helpers are zero
+    # blend shapes by the attribute values they belong to: vertex indices and offsets in metres
     targets: dict[tuple[str, ...], tuple[Index, Array]]
 
     @classmethod
@@ -104,14 +89,9 @@ class MakeHuman:
         return np.unique(np.concatenate(self.body_faces))
 
     def shapes(self, adults: Adults, rows: Index) -> tuple[Array, Array]:
-        """The bodies of some adults, in MakeHuman's rest pose.
+        """The bodies of n adults in MakeHuman's rest pose: vertices `(n, R, 3)` and joints `(n, 24, 3)`, metres.
 
-        Args:
-            adults: n adults, see `ljn.body.build.adults`.
-            rows: `(R,)`, the vertices wanted.
-
-        Returns:
-            Vertices `(n, R, 3)` and joints `(n, 24, 3)`, metres.
+        `rows` `(R,)` are the vertices wanted.
         """
         coefficients = blend_weights(list(self.targets), adults)  # (n, T)
         helpers = np.flatnonzero(self.cubes.any(0))
@@ -128,7 +108,7 @@ class MakeHuman:
 
 
 def _read_obj(path: Path) -> tuple[Array, dict[str, list[list[int]]]]:
-    """Vertices as they stand and the polygons of each group; every other kind of line is left out."""
+    """Vertices in the file's unit and the polygons of each group; every other kind of line is left out."""
     vertices: list[list[float]] = []
     groups: dict[str, list[list[int]]] = {}
     faces: list[list[int]] = []

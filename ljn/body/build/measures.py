@@ -122,14 +122,12 @@ def _pierces(start: Array, end: Array, triangle: Array, normal: Array) -> bool:
 def pose_measures(model: BodyModel, vertices: Array) -> dict[str, float]:
     """How a pose changes the mean body: `vertices` `(V, 3)` is that body posed.
 
-    Returns:
-        Percent of change of volume, percent of edges that shrink below half or stretch beyond 1.7 times their
-        length, and the number of faces that pass through others.
+    The change of volume, and the edges that shrink below half or stretch beyond 1.7 times their length, in percent; and
+    the number of faces that pass through others.
     """
     rest, pairs = model.v_template.astype(np.float64), edges(model.faces)
-    ratio = np.linalg.norm(np.subtract(*vertices[pairs.T]), axis=1) / np.linalg.norm(
-        np.subtract(*rest[pairs.T]), axis=1
-    )
+    lengths, rest_lengths = (np.linalg.norm(np.subtract(*body[pairs.T]), axis=1) for body in (vertices, rest))
+    ratio = lengths / rest_lengths
     return {
         "volume": 100 * float(volume(vertices, model.faces) / volume(rest, model.faces) - 1),
         "squeezed": 100 * float((ratio < 0.5).mean()),
@@ -139,13 +137,7 @@ def pose_measures(model: BodyModel, vertices: Array) -> dict[str, float]:
 
 
 def report(model: BodyModel, num_draws: int = 200, seed: int = 1) -> str:
-    """The measurements of a body, as lines of text.
-
-    Args:
-        model: The body.
-        num_draws: How many random shapes, beta ~ N(0, 1), to measure.
-        seed: Of these draws.
-    """
+    """The measurements of a body and of random shapes of it, beta ~ N(0, 1), as lines of text."""
     betas = np.random.default_rng(seed).normal(size=(num_draws, NUM_BETAS))
     bodies = shaped(model, betas)
     mean_stature, mean_bmi = stature_and_bmi(model.v_template.astype(np.float64), model.faces)

@@ -35,20 +35,11 @@ def draw_body(
     centre: tuple[float, float, float] | None = None,
     colours: Array | None = None,
 ) -> Image:
-    """A shaded picture of one mesh on white.
+    """A shaded picture of one mesh on white, `(height * scale, width * scale, 3)` RGB, from a key of `_VIEWS`.
 
-    Args:
-        vertices: `(V, 3)`, metres, SMPL's rest frame (y up, z forward).
-        faces: `(F, 3)`, vertex indices.
-        view: A key of `_VIEWS`.
-        scale: Pixels a metre.
-        width: Of the window, metres.
-        height: Of the window, metres.
-        centre: `(x, y, z)`, metres, the point in the middle of the picture; None takes the mesh's box.
-        colours: `(F, 3)` RGB in 0-1; None for skin.
-
-    Returns:
-        `(height * scale, width * scale, 3)` RGB.
+    `vertices` are `(V, 3)`, metres, SMPL's rest frame (y up, z forward); `scale` is in pixels a metre, width, height
+    and `centre` in metres, the middle of the picture, by default that of the mesh. `colours` are `(F, 3)` RGB in 0-1;
+    None for skin.
     """
     turn = rotation_about("y", torch.tensor(np.radians(_VIEWS[view]), dtype=torch.float64)).numpy()
     middle = (vertices.min(0) + vertices.max(0)) / 2 if centre is None else np.array(centre)
@@ -62,13 +53,7 @@ def draw_body(
 
 
 def draw_page(models: list[BodyModel], path: Path, seed: int = 2) -> None:
-    """Writes a page of pictures: each body's T-pose, random and extreme shapes; poses and parts of one.
-
-    Args:
-        models: The bodies; the neutral one, or else the first, shows poses and parts.
-        path: The PNG file.
-        seed: Of the random shapes.
-    """
+    """Writes a page of pictures: each body's T-pose, random and extreme shapes; poses and parts of the neutral one."""
     rows: list[tuple[str, Image]] = []
     rng = np.random.default_rng(seed)
     standing = pose_vector(ARMS_DOWN)
@@ -107,16 +92,11 @@ def _draw_parts(model: BodyModel) -> Image:
     colours = _part_colours()[face_parts(model)]
     template = model.v_template.astype(np.float64)
     squat = posed(model, pose_vector(EXTREME_POSES["squat"]))
-    return np.concatenate(
-        [
-            *(
-                draw_body(template, model.faces, view, width=2.0, colours=colours)
-                for view in ("front", "back")
-            ),
-            *(draw_body(squat, model.faces, view, width=1.2, colours=colours) for view in _VIEWS),
-        ],
-        axis=1,
-    )
+    shown = [(template, view, 2.0) for view in ("front", "back")] + [(squat, view, 1.2) for view in _VIEWS]
+    pictures = [
+        draw_body(body, model.faces, view, width=width, colours=colours) for body, view, width in shown
+    ]
+    return np.concatenate(pictures, axis=1)
 
 
 def _write(rows: list[tuple[str, Image]], path: Path) -> None:
@@ -140,11 +120,8 @@ def _write(rows: list[tuple[str, Image]], path: Path) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     picture = PIL.Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3])
     # Colours from a palette make the file a third as large.
-    ramps = [
-        np.linspace(0, 1, 40)[:, None] * np.array(SKIN),
-        np.linspace(1, SKIN, 10),
-        np.linspace(0, [1, 1, 1], 8),
-    ]
+    skin = np.linspace(0, 1, 40)[:, None] * np.array(SKIN)
+    ramps = [skin, np.linspace(1, SKIN, 10), np.linspace(0, [1, 1, 1], 8)]
     ramps += [np.linspace(0.2, 1, 11)[:, None] * colour for colour in _part_colours()]
     palette = PIL.Image.new("P", (1, 1))
     palette.putpalette(np.round(255 * np.concatenate(ramps)).astype(np.uint8).tobytes())

@@ -7,7 +7,7 @@ import torch
 from numpy.typing import NDArray
 
 from ljn.body.skeleton import JOINT_INDEX, NUM_JOINTS
-from ljn.geometry.rotations import rotation_about, rotmat_to_rotvec
+from ljn.geometry.rotations import euler_to_rotmat, rotmat_to_rotvec
 
 Angles = Mapping[str, tuple[float, float, float]]
 
@@ -42,17 +42,11 @@ def pose_vector(angles: Angles) -> NDArray[np.float64]:
     """The pose `(72,)`, radians, of Euler angles written as in `EXTREME_POSES`."""
     rotmats = torch.eye(3, dtype=torch.float64).repeat(NUM_JOINTS, 1, 1)
     for name, (x, y, z) in angles.items():
-        if name in JOINT_INDEX:
-            rotmats[JOINT_INDEX[name]] = _from_euler(x, y, z)
-        else:
-            rotmats[JOINT_INDEX[f"l_{name}"]] = _from_euler(x, y, z)
-            rotmats[JOINT_INDEX[f"r_{name}"]] = _from_euler(x, -y, -z)
+        turns = (
+            {name: (z, y, x)} if name in JOINT_INDEX else {f"l_{name}": (z, y, x), f"r_{name}": (-z, -y, x)}
+        )
+        for joint, turn in turns.items():
+            rotmats[JOINT_INDEX[joint]] = euler_to_rotmat(
+                "zyx", torch.tensor(turn, dtype=torch.float64).deg2rad()
+            )
     return rotmat_to_rotvec(rotmats).flatten().numpy()
-
-
-def _from_euler(x: float, y: float, z: float) -> torch.Tensor:
-    about = {
-        axis: rotation_about(axis, torch.tensor(np.radians(angle), dtype=torch.float64))
-        for axis, angle in (("x", x), ("y", y), ("z", z))
-    }
-    return about["z"] @ about["y"] @ about["x"]

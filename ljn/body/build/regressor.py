@@ -9,15 +9,7 @@ from ljn.body.skeleton import JOINT_NAMES, MIRROR, NUM_JOINTS, PARENTS
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
 
-_REACH = {
-    "pelvis": 0.30,
-    "spine1": 0.30,
-    "spine2": 0.30,
-    "spine3": 0.30,
-    "neck": 0.30,
-    "collar": 0.30,
-    "hip": 0.30,
-}
+_REACH = dict.fromkeys(("pelvis", "spine1", "spine2", "spine3", "neck", "collar", "hip"), 0.30)
 _REACH_OF_OTHERS = 0.16
 """Metres around a joint within which its vertices lie."""
 _MAX_CANDIDATES = 900
@@ -61,20 +53,11 @@ def fit_regressor(bodies: Array, joints: Array, weights: Array, mirror: Index, c
 
 
 def mean_of_points(points: Array, targets: Array) -> Array:
-    """The weights `(N,)`, at least 0 and summing to 1, whose mean of points is nearest to the targets.
-
-    Args:
-        points: `(n, N, 3)`, n samples of N points, metres.
-        targets: `(n, 3)`, metres.
-    """
+    """The weights `(N,)`, at least 0 and summing to 1, whose mean of points `(n, N, 3)` is nearest to targets."""
     scale = np.sqrt(len(points))
-    matrix = np.concatenate(
-        [
-            points.swapaxes(1, 2).reshape(-1, points.shape[1]),
-            np.full((1, points.shape[1]), _SUM_WEIGHT * scale),
-            _RIDGE * scale * np.eye(points.shape[1]),
-        ]
-    )
+    coordinates = points.swapaxes(1, 2).reshape(-1, points.shape[1])
+    ridge = _RIDGE * scale * np.eye(points.shape[1])
+    matrix = np.concatenate([coordinates, np.full((1, points.shape[1]), _SUM_WEIGHT * scale), ridge])
     right = np.concatenate([targets.ravel(), [_SUM_WEIGHT * scale], np.zeros(points.shape[1])])
     weights, _ = import_scipy("optimize").nnls(matrix, right, maxiter=20_000)
     weights[weights < 1e-4] = 0

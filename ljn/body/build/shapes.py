@@ -15,15 +15,9 @@ _TALLER = 0.02
 
 
 def fit_shapes(bodies: Array, faces: Index, mirror: Index) -> tuple[Array, Array]:
-    """Mean and principal components of bodies, vertices weighted by the area around them.
+    """Mean `(V, 3)` and principal components of bodies `(n, V, 3)`, vertices weighted by the area around them.
 
-    Args:
-        bodies: `(n, V, 3)`, metres, T-pose.
-        faces: `(F, 3)`.
-        mirror: `(V,)`, left-right counterparts.
-
-    Returns:
-        The mean `(V, 3)`, and the offsets of one standard deviation `(V, 3, 10)`; metres, exactly symmetric.
+    Components `(V, 3, 10)` are the offsets of one standard deviation; metres, exactly symmetric.
     """
     mean = symmetrised(bodies.mean(0), mirror)
     root = np.sqrt(vertex_areas(mean, faces))[:, None]

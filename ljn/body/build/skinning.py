@@ -23,21 +23,16 @@ _LR = list(MIRROR)
 
 
 def clean_weights(weights: Array, topology: Topology) -> Array:
-    """Weights smoothed over the surface, exactly symmetric, of at most four joints, rows summing to 1.
+    """Weights `(V, 24)` smoothed over the surface, exactly symmetric, of at most four joints, rows summing to 1.
 
     The shoulders are smoothed further than the rest, and the flank goes less with the arm: else a raised arm
     carries a bulge of the armpit with it.
-
-    Args:
-        weights: `(V, 24)`, at least 0.
-        topology: The mesh.
     """
     weights = weights / weights.sum(1, keepdims=True)
     mean = neighbour_mean(topology.faces)
     usual, soft = smoothed(weights, mean, _PASSES), smoothed(weights, mean, _SHOULDER_PASSES)
-    arm = soft[
-        :, [JOINT_INDEX[side + joint] for side in ("l_", "r_") for joint in ("collar", "shoulder")]
-    ].sum(1)
+    arms = [JOINT_INDEX[side + joint] for side in ("l_", "r_") for joint in ("collar", "shoulder")]
+    arm = soft[:, arms].sum(1)
     forearm = soft[:, [JOINT_INDEX["l_elbow"], JOINT_INDEX["r_elbow"]]].sum(1)
     at_shoulder = ((arm > 0.02) & (arm < 0.995) & (forearm < 0.002)).astype(np.float64)[:, None]
     at_shoulder = smoothed(at_shoulder, mean, _SHOULDER_PASSES)
@@ -75,14 +70,9 @@ def _sparse_symmetric(weights: Array, mirror: NDArray[np.int64]) -> Array:
 
 
 def joint_transforms(rotmats: Array, joints: Array) -> tuple[Array, Array]:
-    """How each joint moves what is fixed to it.
+    """How each joint moves what is fixed to it: rotations `(24, 3, 3)` and translations `(24, 3)`; x goes to R x + t.
 
-    Args:
-        rotmats: `(24, 3, 3)`, relative to the parent.
-        joints: `(24, 3)`, rest positions, metres.
-
-    Returns:
-        Rotations `(24, 3, 3)` and translations `(24, 3)`: x goes to R x + t.
+    From rotations `(24, 3, 3)` relative to the parent and rest positions `(24, 3)`, metres.
     """
     rotations, positions = np.empty((NUM_JOINTS, 3, 3)), np.empty((NUM_JOINTS, 3))
     for joint, parent in enumerate(PARENTS):
@@ -100,16 +90,7 @@ def blend_linear(weights: Array, rotations: Array, translations: Array) -> tuple
 
 
 def blend_dual_quaternions(weights: Array, rotations: Array, translations: Array) -> tuple[Array, Array]:
-    """Dual-quaternion skinning (Kavan et al. 2007): each vertex's rotation and translation.
-
-    Args:
-        weights: `(V, 24)`, rows summing to 1.
-        rotations: `(24, 3, 3)`, of the joints.
-        translations: `(24, 3)`, metres.
-
-    Returns:
-        Rotation matrices `(V, 3, 3)` and translations `(V, 3)`.
-    """
+    """Dual-quaternion skinning (Kavan et al. 2007): each vertex's rotation `(V, 3, 3)` and translation `(V, 3)`."""
     real = _quaternions(rotations)
     for joint, parent in enumerate(PARENTS):
         # q and -q are one rotation; neighbours must take the nearer ones, or the mean goes the long way round.
@@ -136,17 +117,9 @@ def apply_inverse(transform: tuple[Array, Array], vertices: Array) -> Array:
 
 
 def to_tpose(vertices: Array, joints: Array, weights: Array) -> tuple[Array, Array]:
-    """A body from MakeHuman's rest pose (arms at about 45 degrees) in SMPL's T-pose.
+    """Vertices `(V, 3)` and joints `(24, 3)`, metres, from MakeHuman's rest pose (arms at 45 degrees) in the T-pose.
 
     It is the T-pose that dual-quaternion skinning carries exactly onto the sculpted body.
-
-    Args:
-        vertices: `(V, 3)`, metres.
-        joints: `(24, 3)`, metres.
-        weights: `(V, 24)`.
-
-    Returns:
-        Vertices `(V, 3)` and joints `(24, 3)`, metres.
     """
     rotations = _tpose_rotations(joints)
     moved = joints.copy()

@@ -17,11 +17,9 @@ def edges(faces: Index) -> Index:
 
 
 def neighbour_mean(faces: Index, vertices: Array | None = None) -> Any:
-    """The sparse matrix `(V, V)` that takes the mean over each vertex's neighbours.
+    """The sparse matrix `(V, V)` that takes the mean over each vertex's neighbours in a closed mesh.
 
-    Args:
-        faces: `(F, 3)`, of a closed mesh.
-        vertices: `(V, 3)`: neighbours count by their inverse distance here; None counts all alike.
+    All count alike, or, where `vertices` `(V, 3)` are given, by their inverse distance there.
     """
     sparse = import_scipy("sparse")
     rows, columns = edges(faces).T  # closed: each edge stands here in both directions

@@ -23,17 +23,11 @@ _ON_PLANE = 1e-6
 
 @dataclass(frozen=True)
 class Topology:
-    """The triangles of every embedded body.
+    """The triangles of every embedded body."""
 
-    Attributes:
-        kept: `(V,)`, which of the source's vertices these are, from the head down.
-        faces: `(F, 3)`, indices into `kept`, counter-clockwise from outside; the second half mirrors the first.
-        mirror: `(V,)`, each vertex's left-right counterpart.
-    """
-
-    kept: Index
-    faces: Index
-    mirror: Index
+    kept: Index  # `(V,)`, which of the source's vertices these are, from the head down
+    faces: Index  # `(F, 3)`, indices into `kept`, counter-clockwise from outside; the second half mirrors the first
+    mirror: Index  # `(V,)`, each vertex's left-right counterpart
 
 
 def mirror_vertices(vertices: Array) -> Index:

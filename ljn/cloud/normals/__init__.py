@@ -40,5 +40,4 @@ def get_normal_estimator(name: str) -> NormalEstimator:
     if name == "open3d":
         import_open3d()
     module, _, attribute = _ESTIMATORS[name].partition(":")
-    estimator: NormalEstimator = getattr(import_module(module), attribute)
-    return estimator
+    return getattr(import_module(module), attribute)

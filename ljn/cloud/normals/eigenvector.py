@@ -18,8 +18,8 @@ def smallest_eigenvector(
     return null_vector(xx, xy, xz, yy, yz, zz, smallest_eigenvalue(spread, cosine))
 
 
-# The parts of the solution. Those without a branch, of which a loop over many matrices makes vector instructions,
-# divide by zero where what comes of it is not used.
+# The parts of the solution. Those without a branch, so that a loop over many matrices is compiled to vector
+# instructions, divide by zero where the quotient is not used.
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
@@ -30,14 +30,8 @@ def scaled(
     trace = xx + yy + zz
     scale = 1.0 / trace if trace > 0.0 else 0.0
     equal = 0.0 if trace > 0.0 else 1.0 / 3.0  # a matrix of zeros has equal eigenvalues, at a trace of 1 too
-    xx, xy, xz, yy, yz, zz = (
-        xx * scale + equal,
-        xy * scale,
-        xz * scale,
-        yy * scale + equal,
-        yz * scale,
-        zz * scale + equal,
-    )
+    xx, yy, zz = xx * scale + equal, yy * scale + equal, zz * scale + equal
+    xy, xz, yz = xy * scale, xz * scale, yz * scale
     a, b, c = xx - 1.0 / 3.0, yy - 1.0 / 3.0, zz - 1.0 / 3.0
     spread = math.sqrt((a * a + b * b + c * c + 2.0 * (xy * xy + xz * xz + yz * yz)) / 6.0)
     determinant = a * (b * c - yz * yz) - xy * (xy * c - yz * xz) + xz * (xy * yz - b * xz)
@@ -62,11 +56,8 @@ def null_vector(
     x0, y0, z0 = xy * yz - xz * b, xz * xy - a * yz, a * b - xy * xy
     x1, y1, z1 = xy * c - xz * yz, xz * xz - a * c, a * yz - xy * xz
     x2, y2, z2 = b * c - yz * yz, yz * xz - xy * c, xy * yz - b * xz
-    best, second, third = (
-        x0 * x0 + y0 * y0 + z0 * z0,
-        x1 * x1 + y1 * y1 + z1 * z1,
-        x2 * x2 + y2 * y2 + z2 * z2,
-    )
+    best, second = x0 * x0 + y0 * y0 + z0 * z0, x1 * x1 + y1 * y1 + z1 * z1
+    third = x2 * x2 + y2 * y2 + z2 * z2
     x, y, z = (x1, y1, z1) if second > best else (x0, y0, z0)
     best = second if second > best else best
     x, y, z = (x2, y2, z2) if third > best else (x, y, z)

@@ -23,14 +23,9 @@ def open3d_normals(cloud: Cloud, depth: np.ndarray, camera: Camera, neighbours: 
 def knn_normals(cloud: Cloud, depth: np.ndarray, camera: Camera, neighbours: int = 30) -> np.ndarray:
     """Normals of planes fitted to the nearest neighbours among the sampled points; Open3D's, without Open3D.
 
-    Args:
-        cloud: The points; each counts as its own neighbour, and one that comes twice counts twice.
-        depth: Not used; every estimator takes it.
-        camera: Not used.
-        neighbours: Neighbours of a point, itself included; all points where there are fewer.
-
-    Returns:
-        `(N, 3)` float32. Where the neighbours are one place or a line: towards the camera.
+    `(N, 3)` float32; where the neighbours are one place or a line: towards the camera. A point counts among its
+    neighbours, and one that comes twice counts twice; where there are fewer points, all count. As of every estimator,
+    depth and camera are arguments, too.
 
     Raises:
         ValueError: A point is not finite, or fewer than three neighbours are asked for.
@@ -57,7 +52,7 @@ def _knn_normals(points: np.ndarray, k: int) -> np.ndarray:
     num_points = points.shape[1]
     corner, size, shape = _choose_grid(points, 0.3 * k)
     order, start = _sort_into_cells(points, corner, size, shape)
-    points = _in_order(points, order)
+    points = np.ascontiguousarray(points[:, order])
     shared, private = np.empty((3, num_points)), np.empty((3, num_points))
     squared, work = np.empty(num_points), np.empty(num_points + 1)
     chosen = np.empty(num_points + 1, np.int64)
@@ -129,11 +124,8 @@ def _enlarge(size: float, extent: np.ndarray, max_cells: int) -> tuple[float, tu
         size = 1.0
     while True:
         # In floating point, where the product cannot overflow.
-        nx, ny, nz = (
-            math.floor(extent[0] / size) + 1.0,
-            math.floor(extent[1] / size) + 1.0,
-            math.floor(extent[2] / size) + 1.0,
-        )
+        nx, ny = math.floor(extent[0] / size) + 1.0, math.floor(extent[1] / size) + 1.0
+        nz = math.floor(extent[2] / size) + 1.0
         if nx * ny * nz <= max_cells:
             return size, (int(nx), int(ny), int(nz))
         size *= 1.1
@@ -143,11 +135,8 @@ def _enlarge(size: float, extent: np.ndarray, max_cells: int) -> tuple[float, tu
 def _cell_of(points: np.ndarray, i: int, corner: np.ndarray, size: float, shape: tuple[int, int, int]) -> int:
     """Number of point `i`'s cell; along x they follow each other."""
     nx, ny, _ = shape
-    x, y, z = (
-        int((points[0, i] - corner[0]) / size),
-        int((points[1, i] - corner[1]) / size),
-        int((points[2, i] - corner[2]) / size),
-    )
+    x, y = int((points[0, i] - corner[0]) / size), int((points[1, i] - corner[1]) / size)
+    z = int((points[2, i] - corner[2]) / size)
     return (z * ny + y) * nx + x
 
 
@@ -172,16 +161,6 @@ def _sort_into_cells(
         order[following[cells[i]]] = i
         following[cells[i]] += 1
     return order, start
-
-
-@numba.njit(cache=True, nogil=True)
-def _in_order(points: np.ndarray, order: np.ndarray) -> np.ndarray:
-    """The points `(3, N)` in that order."""
-    ordered = np.empty_like(points)
-    for axis in range(3):
-        for i in range(len(order)):
-            ordered[axis, i] = points[axis, order[i]]
-    return ordered
 
 
 @numba.njit(cache=True, nogil=True)

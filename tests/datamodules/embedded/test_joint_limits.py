@@ -3,7 +3,6 @@ import torch
 
 from datamodules.sources.embedded import EmbeddedSource
 from datamodules.sources.embedded.joint_limits import (
-    HINGES,
     RANGES,
     SHOULDER_ACROSS_DEG,
     SHOULDER_BACK_DEG,
@@ -117,7 +116,7 @@ def test_elbows_bend_forwards_only(posed, place, side):
     assert joints[f"{side}_wrist"][0, 2] > joints[f"{side}_elbow"][0, 2] - 0.05
 
 
-@pytest.mark.parametrize("kind", HINGES)
+@pytest.mark.parametrize("kind", ["knee", "elbow"])
 def test_hinges_hardly_bend_sideways(kind):
     for side in SIDES:
         angles = angles_of(within_limits(random_poses()), f"{side}_{kind}", kind)

@@ -4,7 +4,6 @@ import torch
 
 from datamodules.sources.embedded.recombination import (
     LEFT_ARM,
-    LEGS,
     RIGHT_ARM,
     TRUNK,
     Donors,
@@ -17,6 +16,7 @@ from ljn.body.kinematics import SIDES, mirror, without_heading
 from ljn.body.skeleton import JOINT_INDEX, MIRROR, NUM_JOINTS, ROOT
 from ljn.geometry.rotations import rotmat_to_rotvec, rotvec_to_rotmat
 
+LEGS = tuple({*range(NUM_JOINTS)} - {*TRUNK, *LEFT_ARM, *RIGHT_ARM})
 PARTS = (LEGS, TRUNK, LEFT_ARM, RIGHT_ARM)
 
 
@@ -43,7 +43,9 @@ def rng():
 
 def test_the_parts_are_the_whole_body_and_mirror_onto_themselves():
     assert sorted([joint for part in PARTS for joint in part]) == list(range(NUM_JOINTS))
-    assert ROOT in LEGS
+    assert sorted(LEGS) == sorted(
+        [ROOT, *(joint for kind in ("hip", "knee", "ankle", "foot") for joint in both(kind))]
+    )
     for part, mirrored in ((LEGS, LEGS), (TRUNK, TRUNK), (LEFT_ARM, RIGHT_ARM)):
         assert {MIRROR[joint] for joint in part} == set(mirrored)
 
