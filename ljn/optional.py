@@ -31,8 +31,3 @@ def import_pyrender() -> Any:
         "data.synthesis.renderer=zbuffer"
     )
     return _import("pyrender", fix)
-
-
-def import_trimesh() -> Any:
-    """The `trimesh` module, which writes meshes; an `ImportError` where it is missing."""
-    return _import("trimesh", "trimesh`; it writes meshes")

@@ -190,15 +190,15 @@ class JointRegressors(nn.Module):
         self.num_joints = len(ancestors)
         self.register_buffer("ancestors", torch.tensor(ancestors, dtype=torch.int64), persistent=False)
         self.ancestors: Tensor
-        num_own = num_angles * (1 + len(ancestors[0])) + NUM_BETAS
-        self.num_own = num_own
-        self.first = StackedLinear(self.num_joints, num_own + feature_channels, channels[0])
+        num_inputs = num_angles * (1 + len(ancestors[0])) + NUM_BETAS
+        self.num_inputs = num_inputs
+        self.first = StackedLinear(self.num_joints, num_inputs + feature_channels, channels[0])
         self.first_activation = StackedPReLU(self.num_joints)
         self.rest = stacked_perceptron(self.num_joints, [*channels, num_angles], last_activation=False)
 
     def share(self, feature: Tensor) -> Tensor:
         """The first layer's part that all iterations share: `(B, C)` -> `(k, B, channels[0])`."""
-        return feature @ self.first.weight[..., self.num_own :].mT + self.first.bias[:, None]
+        return feature @ self.first.weight[..., self.num_inputs :].mT + self.first.bias[:, None]
 
     def forward(self, pose: Tensor, refined: Tensor, betas: Tensor, shared: Tensor) -> Tensor:
         """Refined rotations of the level.
@@ -213,8 +213,8 @@ class JointRegressors(nn.Module):
             `(B, k, A)`.
         """
         seen = refined[:, self.ancestors].flatten(2)  # (B, k, ancestors * A)
-        own = torch.cat([pose, seen, betas[:, None].expand(-1, self.num_joints, -1)], -1)
-        hidden = torch.baddbmm(shared, own.transpose(0, 1), self.first.weight[..., : self.num_own].mT)
+        inputs = torch.cat([pose, seen, betas[:, None].expand(-1, self.num_joints, -1)], -1)
+        hidden = torch.baddbmm(shared, inputs.transpose(0, 1), self.first.weight[..., : self.num_inputs].mT)
         return pose + self.rest(self.first_activation(hidden)).transpose(0, 1)
 
 
@@ -256,7 +256,7 @@ class DirectBodyNetwork(CloudBodyNetwork):
 
 def _ancestors(joint: int) -> list[int]:
     """All joints on the way from a joint's parent up to the root."""
-    found = []
+    ancestors = []
     while (joint := PARENTS[joint]) >= 0:
-        found.append(joint)
-    return found
+        ancestors.append(joint)
+    return ancestors

@@ -98,13 +98,13 @@ class LocalJointNetwork(CloudDetector):
         """
         weight, bias = self.first.weight, self.first.bias
         num_joints, batch, group_size, _ = grouped.shape
-        own, pooled_weight, edm_weight = weight.split(
+        point_weight, pooled_weight, edm_weight = weight.split(
             [self.num_local, pooled.shape[-1], weight.shape[-1] - self.num_local - pooled.shape[-1]], -1
         )
         shared = pooled @ pooled_weight.mT + bias[:, None]  # (K, B, C')
         if self.edm:
             rows = distance_matrix(initial_joints).transpose(0, 1)  # (K, B, K)
             shared = torch.baddbmm(shared, rows, edm_weight.mT)
-        hidden = torch.bmm(grouped.reshape(num_joints, batch * group_size, -1), own.mT)
+        hidden = torch.bmm(grouped.reshape(num_joints, batch * group_size, -1), point_weight.mT)
         hidden = hidden.unflatten(1, (batch, group_size)) + shared[:, :, None]
         return self.first_activation(hidden).flatten(1, 2)

@@ -27,7 +27,7 @@ class FrameFiles(NamedTuple):
 
     name: str  # names its outputs
     depth: Path
-    keypoints: Path
+    keypoints: Path | None
     mask: Path | None
 
     def read(self) -> FrameImages:
@@ -38,7 +38,8 @@ class FrameFiles(NamedTuple):
             ValueError: One cannot be read.
         """
         mask = None if self.mask is None else read_mask(self.mask)
-        return FrameImages(read_depth(self.depth), read_keypoints(self.keypoints), mask)
+        keypoints = None if self.keypoints is None else read_keypoints(self.keypoints)
+        return FrameImages(read_depth(self.depth), keypoints, mask)
 
 
 class FrameResult(NamedTuple, Generic[FrameT]):
@@ -82,14 +83,17 @@ def predict_frames(
             yield result
 
 
-def find_frames(input: str | Path, keypoints: str | Path, mask: str | Path | None) -> list[FrameFiles]:
-    """The frames of a depth image, or of a folder of them with keypoints (and masks) of the same stem in theirs.
+def find_frames(
+    input: str | Path, keypoints: str | Path | None = None, mask: str | Path | None = None
+) -> list[FrameFiles]:
+    """The frames of a depth image, or of a folder of them; with keypoints and masks of the same stem in theirs.
 
     Raises:
         FileNotFoundError: There is no such file or folder, or no depth image in it.
         ValueError: Files and folders are mixed, or two depth images share a stem.
     """
-    paths = {"input": Path(input), "keypoints": Path(keypoints)} | ({"mask": Path(mask)} if mask else {})
+    given = {"input": input, "keypoints": keypoints, "mask": mask}
+    paths = {name: Path(path) for name, path in given.items() if path}
     for name, path in paths.items():
         if not path.exists():
             raise FileNotFoundError(f"{name}: no file or folder '{path}'")
@@ -97,7 +101,7 @@ def find_frames(input: str | Path, keypoints: str | Path, mask: str | Path | Non
         kinds = (f"{name} is a {'folder' if path.is_dir() else 'file'}" for name, path in paths.items())
         raise ValueError(f"input, keypoints, mask: expected files or folders alike, got: {', '.join(kinds)}")
     if not paths["input"].is_dir():
-        return [FrameFiles(paths["input"].stem, paths["input"], paths["keypoints"], paths.get("mask"))]
+        return [FrameFiles(paths["input"].stem, paths["input"], paths.get("keypoints"), paths.get("mask"))]
     images = sorted(path for path in paths["input"].iterdir() if path.suffix.lower() in DEPTH_SUFFIXES)
     if not images:
         raise FileNotFoundError(f"input: no depth image ({', '.join(DEPTH_SUFFIXES)}) in '{paths['input']}'")
@@ -106,8 +110,12 @@ def find_frames(input: str | Path, keypoints: str | Path, mask: str | Path | Non
             raise ValueError(
                 f"input: '{before.name}' and '{path.name}' would write the same outputs; rename one"
             )
-    masks = [paths["mask"] / f"{path.stem}.png" if mask else None for path in images]
     return [
-        FrameFiles(path.stem, path, paths["keypoints"] / f"{path.stem}.json", mask_path)
-        for path, mask_path in zip(images, masks)
+        FrameFiles(
+            path.stem,
+            path,
+            paths["keypoints"] / f"{path.stem}.json" if keypoints else None,
+            paths["mask"] / f"{path.stem}.png" if mask else None,
+        )
+        for path in images
     ]

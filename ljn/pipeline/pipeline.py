@@ -145,6 +145,11 @@ class Pipeline:
             )
         return cls(detector, _stage(module.to(device), mesh_checkpoint))
 
+    @property
+    def takes_keypoints(self) -> bool:
+        """Whether the joint detector needs 2D keypoints."""
+        return "initial_joints" in self.detector.module.takes
+
     def __call__(self, depth: Any, camera: Camera, keypoints: Any = None, mask: Any = None) -> Prediction:
         """Predict from one image, or from a batch of one camera's images.
 
@@ -182,12 +187,11 @@ class Pipeline:
     def observe(self, depth: Any, camera: Camera, keypoints: Any = None, mask: Any = None) -> ObservedFrame:
         """Check one image's input and observe it for each stage; arguments as in a call."""
         metres = body_depth(depth, camera, mask)
-        detector = self.detector.module
         named = None
         if keypoints is not None:
             named = smpl_keypoints(keypoints)
             check_place(named, metres, camera)
-        elif "initial_joints" in detector.takes:
+        elif self.takes_keypoints:
             raise ValueError(
                 "keypoints: expected the person's 2D keypoints, which this joint detector takes, got none; give them, "
                 "or a detector that was trained without: experiment=detector/cascade_no_keypoints"

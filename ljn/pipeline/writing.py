@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 
 from ljn.geometry.camera import Camera
-from ljn.optional import import_trimesh
 from ljn.pipeline.pipeline import Prediction
 
 _GLTF_FROM_CAMERA = np.array([1.0, -1.0, -1.0])
@@ -28,4 +27,6 @@ def write_mesh(path: Path, vertices: np.ndarray, faces: np.ndarray) -> None:
     """
     if path.suffix == ".glb":
         vertices = vertices * _GLTF_FROM_CAMERA
-    import_trimesh().Trimesh(vertices, faces, process=False).export(path)
+    from trimesh import Trimesh  # not for arrays alone
+
+    Trimesh(vertices, faces, process=False).export(path)

@@ -14,7 +14,6 @@ from tqdm import tqdm
 from ljn.body.skeleton import JOINT_NAMES
 from ljn.geometry.camera import Camera
 from ljn.geometry.distance import distances_to_mesh
-from ljn.optional import import_trimesh
 from ljn.pipeline.frames import FrameFiles, find_frames, predict_frames
 from ljn.pipeline.inputs import read_camera
 from ljn.pipeline.pictures import draw_prediction
@@ -24,8 +23,8 @@ from ljn.runs.files import path_part, write_json
 from ljn.tasks.validation import check_writable
 
 _LOG = logging.getLogger(__name__)
-_NEEDED = ("task.input", "task.camera", "task.keypoints", "ckpt_path")
-_OPTIONAL = ("task.mask", "task.mesh_ckpt_path")
+_NEEDED = ("task.input", "task.camera", "ckpt_path")
+_OPTIONAL = ("task.keypoints", "task.mask", "task.mesh_ckpt_path")
 _COMMAND = (
     "python run.py task=predict task.input=DEPTH.png task.camera=CAMERA.yaml task.keypoints=KEYPOINTS.json "
     "ckpt_path=DETECTOR.ckpt task.mesh_ckpt_path=MESH.ckpt"
@@ -49,7 +48,6 @@ def predict(cfg: DictConfig) -> dict[str, float]:
     Raises:
         FileNotFoundError: A file is missing.
         ValueError: The input or a checkpoint is wrong; or a frame of a folder is, after all others are written.
-        ImportError: The package that writes meshes is missing.
     """
     task = cfg.task
     values = {key: OmegaConf.select(cfg, key) for key in _NEEDED + _OPTIONAL}
@@ -61,12 +59,15 @@ def predict(cfg: DictConfig) -> dict[str, float]:
     frames = find_frames(task.input, task.keypoints, task.mask)
     directory = Path(cfg.paths.output_dir) / "predictions" / path_part(Path(task.input).stem)
     check_writable(directory)
-    if task.mesh_ckpt_path is not None:
-        import_trimesh()
     if cfg.num_threads is not None:
         torch.set_num_threads(cfg.num_threads)
     use_gpu = cfg.trainer.accelerator != "cpu" and torch.cuda.is_available()
     pipeline = Pipeline.load(cfg.ckpt_path, task.mesh_ckpt_path, "cuda" if use_gpu else "cpu")
+    if task.keypoints is None and pipeline.takes_keypoints:
+        raise ValueError(
+            f"task.keypoints: expected a path, since the detector '{cfg.ckpt_path}' takes keypoints, got null; "
+            f"{_COMMAND}, or a detector without: experiment=detector/cascade_no_keypoints"
+        )
 
     results = _predict(pipeline, frames, camera, directory, may_fail=Path(task.input).is_dir())
     failed = [name for name, result in results.items() if "error" in result]
@@ -119,8 +120,10 @@ def _write(path: Path, prediction: Prediction, depth: np.ndarray, camera: Camera
     """Write a frame's files beside `path`, which has no suffix; returns the summary's facts of it."""
     write_arrays(path.with_name(f"{path.name}.npz"), prediction, camera)
     draw_prediction(prediction, depth, camera).savefig(path.with_name(f"{path.name}.png"))
-    is_filled = prediction.confidences == 0
-    facts: dict[str, Any] = {"filled_in": [JOINT_NAMES[joint] for joint in np.flatnonzero(is_filled)]}
+    facts: dict[str, Any] = {}
+    if prediction.confidences is not None:
+        is_filled = prediction.confidences == 0
+        facts["filled_in"] = [JOINT_NAMES[joint] for joint in np.flatnonzero(is_filled)]
     if prediction.vertices is None or prediction.faces is None:
         return facts
     for suffix in (".ply", ".glb"):

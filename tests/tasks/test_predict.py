@@ -39,7 +39,7 @@ def files(kinect, tmp_path_factory):
     coco = {
         keypoint: keypoints[JOINT_INDEX[joint]].tolist()
         for joint, taken in ORDERS["coco17"].joints.items()
-        for keypoint in taken.keypoints
+        for keypoint in taken
     }
     (directory / "keypoints.json").write_text(json.dumps([coco.get(name) for name in names]))
     (directory / "camera.json").write_text(json.dumps(vars(kinect)))
@@ -132,7 +132,7 @@ def test_keypoints_that_are_missing_for_a_frame_fail_that_frame(folders, config,
     assert {path.stem for path in outputs.glob("*.npz")} == {"a"}
 
 
-NEEDED = ["task.input", "task.camera", "task.keypoints", "ckpt_path"]
+NEEDED = ["task.input", "task.camera", "ckpt_path"]
 
 
 @pytest.mark.parametrize("key", NEEDED)
@@ -143,6 +143,24 @@ def test_what_a_prediction_needs_is_named(key, config):
         predict(config(f"{key}=null"))
 
 
+def test_keypoints_are_needed_where_the_detector_takes_them_alone(config, write_checkpoint, tmp_path):
+    with pytest.raises(
+        ValueError, match=r"task\.keypoints: expected a path, since the detector .* takes keypoints"
+    ):
+        predict(config("task.keypoints=null"))
+    detector = write_checkpoint("detector/cascade_no_keypoints", "model.patch_sizes_m=[0.5]")
+    mesh = write_checkpoint("mesh/kinematic", "model.channels=16")
+    changes = ("task.keypoints=null", f"ckpt_path={detector}", f"task.mesh_ckpt_path={mesh}")
+    assert predict(config(*changes))["predict/frames"] == 1
+    with np.load(tmp_path / "predictions" / "depth" / "depth.npz") as arrays:
+        assert {"joints", "vertices", "points"} <= set(arrays) - {
+            "keypoints",
+            "initial_joints",
+            "confidences",
+        }
+        assert arrays["vertices"].shape == (6890, 3)
+
+
 def test_a_number_is_no_path(config):
     with pytest.raises(
         ValueError, match=r"task\.input: expected a path, got 20230401, .*'task\.input=\"PATH\"'"
@@ -150,7 +168,7 @@ def test_a_number_is_no_path(config):
         predict(config("task.input=2023_04_01"))
 
 
-@pytest.mark.parametrize("key", [*NEEDED, "task.mask", "task.mesh_ckpt_path"])
+@pytest.mark.parametrize("key", [*NEEDED, "task.keypoints", "task.mask", "task.mesh_ckpt_path"])
 def test_a_missing_file_is_an_error(key, config):
     with pytest.raises(FileNotFoundError, match=r"no file .*'nowhere\.x'"):
         predict(config(f"{key}=nowhere.x"))
