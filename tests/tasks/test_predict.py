@@ -38,8 +38,8 @@ def files(kinect, tmp_path_factory):
     names = ORDERS["coco17"].names
     coco = {
         keypoint: keypoints[JOINT_INDEX[joint]].tolist()
-        for joint, taken in ORDERS["coco17"].joints.items()
-        for keypoint in taken.keypoints
+        for joint, names in ORDERS["coco17"].joints.items()
+        for keypoint in names
     }
     (directory / "keypoints.json").write_text(json.dumps([coco.get(name) for name in names]))
     (directory / "camera.json").write_text(json.dumps(vars(kinect)))
