@@ -86,7 +86,6 @@ def line_image(pixels, noise_m):
     "pixels",
     [
         [(40, 30)],
-        [(40, 30), (41, 30)],
         [(40, 30), (41, 31)],
         [(40 + i, 30) for i in range(5)],
         [(40, 30 + i) for i in range(5)],
@@ -95,7 +94,6 @@ def line_image(pixels, noise_m):
         [(0, 0), (1, 0)],
         [(99, 79), (98, 79)],
     ],
-    ids=["one", "two", "two diagonal", "row", "column", "diagonal", "knight", "first corner", "last corner"],
 )
 def test_pixels_that_span_no_plane_look_straight_at_the_camera(pixels, noise_m):
     depth = line_image(pixels, noise_m)

@@ -8,7 +8,6 @@ from pathlib import Path
 import pytest
 from omegaconf import OmegaConf
 
-from ljn.building import build_each
 from ljn.tasks.evaluate import evaluate
 from ljn.tasks.tracking import log_table, summaries
 from ljn.tasks.train import train
@@ -160,14 +159,6 @@ def test_without_wandb_no_table_is_logged(tmp_path):
     log_table("table", [{"a": 1}], {"csv": {}}, tmp_path / "sweep")
     log_table("table", [{"a": 1}], None, tmp_path / "sweep")
     assert not (tmp_path / "sweep").exists()
-
-
-def test_checkpoints_become_artifacts_only_online(compose_config, tmp_path):
-    on = ("logger.wandb.log_model=true", f"paths.run_dir={tmp_path}")
-    with pytest.raises(ValueError, match="offline=True is an invalid configuration"):
-        build_each(compose_config(*on).logger)
-    loggers = build_each(compose_config("logger=online", *on).logger)
-    assert [getattr(logger, "_log_model", None) for logger in loggers] == [None, True]
 
 
 def test_tensorboard_follows_a_run(smoke_config, tmp_path):
