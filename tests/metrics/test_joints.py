@@ -1,11 +1,10 @@
 import json
 import math
-import subprocess
-import sys
-from pathlib import Path
+import multiprocessing
 
 import pytest
 import torch
+from torch import distributed
 
 from ljn.metrics import JointMetrics, MeshMetrics, SampleMax, functional
 
@@ -126,39 +125,32 @@ def test_sums_stay_float64_in_a_half_precision_module():
     assert values(metrics) == pytest.approx(values(updated(JointMetrics(), batch, [NUM_SAMPLES])), rel=1e-12)
 
 
-DDP_WORKER = """
-import json, sys
-import torch
-import torch.distributed as dist
-from ljn.metrics import JointMetrics
-
-folder, rank = sys.argv[1], int(sys.argv[2])
-torch.set_num_threads(1)
-dist.init_process_group("gloo", init_method=f"file://{folder}/init", rank=rank, world_size=2)
-batch = torch.load(f"{folder}/batch.pt", weights_only=True)
-metrics = JointMetrics()
-# Unequal shares, in a different number of batches.
-for rows in ([slice(0, 4), slice(4, 5)], [slice(5, 13)])[rank]:
-    metrics.update(**{name: value[rows] for name, value in batch.items()})
-print(json.dumps({key: value.item() for key, value in metrics.compute().items()}))
-dist.destroy_process_group()
-"""
+def compute_together(rank, folder, batch, answers):
+    torch.set_num_threads(1)
+    distributed.init_process_group("gloo", init_method=f"file://{folder}/init", rank=rank, world_size=2)
+    metrics = JointMetrics()
+    # Unequal shares, in a different number of batches.
+    for rows in ([slice(0, 4), slice(4, 5)], [slice(5, 13)])[rank]:
+        metrics.update(**{name: value[rows] for name, value in batch.items()})
+    answers.put(values(metrics))
+    distributed.destroy_process_group()
 
 
 @pytest.mark.ddp
 def test_two_processes_compute_what_one_does(tmp_path):
-    if not torch.distributed.is_gloo_available():
+    if not distributed.is_gloo_available():
         pytest.skip("this torch build has no gloo backend")
     batch = make_batch(NUM_SAMPLES)
-    torch.save(batch, tmp_path / "batch.pt")
-    command = [sys.executable, "-c", DDP_WORKER, str(tmp_path)]
-    options = {"cwd": Path(__file__).parents[2], "stdout": subprocess.PIPE, "text": True}
-    workers = [subprocess.Popen([*command, rank], **options) for rank in "01"]
-    try:
-        outputs = [worker.communicate(timeout=120)[0] for worker in workers]
-    finally:
-        for worker in workers:
-            worker.kill()
+    context = multiprocessing.get_context("fork")
+    answers = context.SimpleQueue()
+    workers = [
+        context.Process(target=compute_together, args=(rank, tmp_path, batch, answers)) for rank in range(2)
+    ]
+    for worker in workers:
+        worker.start()
+    for worker in workers:
+        worker.join(60)
+        assert worker.exitcode == 0
     expected = values(updated(JointMetrics(), batch, [NUM_SAMPLES]))
-    for output in outputs:
-        assert json.loads(output) == pytest.approx(expected, rel=1e-12)
+    for _ in workers:
+        assert answers.get() == pytest.approx(expected, rel=1e-12)

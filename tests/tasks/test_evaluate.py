@@ -1,6 +1,5 @@
 import json
 
-import numpy as np
 import pytest
 import torch
 import yaml
@@ -15,46 +14,26 @@ def evaluation(smoke_config, trained, tmp_path, *overrides, ckpt_path=None):
     return smoke_config(tmp_path, "task=evaluate", f"ckpt_path={ckpt_path or checkpoint}", *overrides)
 
 
-def test_another_process_with_other_workers_gives_exactly_the_metrics_of_training(trained, run_py, tmp_path):
+def test_several_checkpoints_go_in_one_multirun_and_other_workers_give_exactly_the_metrics_of_training(
+    trained, run_py, tmp_path
+):
     metrics, run_dir = trained
-    run_py(
-        *(
-            "task=evaluate",
-            f"ckpt_path={run_dir / 'checkpoints' / 'best.ckpt'}",
-            f"paths.output_dir={tmp_path}",
-        ),
-        *("data.num_workers=2", "logger=csv"),
-    )
-    [evaluated] = (tmp_path / "evaluations").iterdir()
-    expected = {name: value for name, value in metrics.items() if name.startswith("test/")}
-    assert json.loads((evaluated / "metrics.json").read_text()) == expected
-    record = json.loads((evaluated / "record.json").read_text())
-    assert record["trained_by"] == run_dir.name
-    assert record["status"] == "complete"
-
-
-def test_several_checkpoints_go_in_one_multirun_with_other_noise(trained, run_py, tmp_path):
-    _, run_dir = trained
     other = edited(trained, tmp_path, lambda content: content["state_dict"]["net.head.4.bias"].add_(0.1))
-    checkpoints = [run_dir / "checkpoints" / "best.ckpt", other]
     done = run_py(
-        *(
-            "-m",
-            "task=evaluate",
-            f"ckpt_path={checkpoints[0]},{checkpoints[1]}",
-            f"paths.output_dir={tmp_path}",
-        ),
-        *("data.synthesis.keypoint_noise_px=15", "logger=csv"),
+        *("-m", "task=evaluate", f"ckpt_path={run_dir / 'checkpoints' / 'best.ckpt'},{other}"),
+        *(f"paths.output_dir={tmp_path}", "data.num_workers=2", "logger=csv"),
     )
     assert "2 jobs: 0 runs, 2 evaluations" in done.stdout
     [sweep] = (tmp_path / "sweeps").iterdir()
     evaluated = list((tmp_path / "evaluations").iterdir())
-    assert len(evaluated) == 2
     groups = {yaml.safe_load((directory / "config.yaml").read_text())["group"] for directory in evaluated}
     assert groups == {sweep.name.removesuffix("-smoke").removesuffix("-small")}
-    for directory in evaluated:
-        metrics = json.loads((directory / "metrics.json").read_text())
-        assert metrics["test/initial_mean_distance_px"] == pytest.approx(15 * np.sqrt(np.pi / 2), rel=0.1)
+    records = [json.loads((directory / "record.json").read_text()) for directory in evaluated]
+    assert {(record["trained_by"], record["status"]) for record in records} == {(run_dir.name, "complete")}
+    results = [json.loads((directory / "metrics.json").read_text()) for directory in evaluated]
+    expected = {name: value for name, value in metrics.items() if name.startswith("test/")}
+    assert [result == expected for result in results].count(True) == 1
+    assert len(results) == 2
 
 
 def test_an_evaluation_needs_a_checkpoint(smoke_config, tmp_path):
@@ -80,18 +59,13 @@ def test_a_checkpoint_of_another_body_is_an_error(trained, smoke_config, tmp_pat
 def test_overrides_change_data_and_nothing_that_the_checkpoint_decides(trained, smoke_config, tmp_path):
     checkpoint = read_checkpoint(trained[1] / "checkpoints" / "best.ckpt")
     cfg = evaluation(smoke_config, trained, tmp_path)
-    merged = with_checkpoint_config(
-        cfg, checkpoint, ["task=evaluate", "data.synthesis.keypoint_noise_px=15", "logger=csv"]
-    )
+    typed = ["task=evaluate", "data.synthesis.keypoint_noise_px=15", "logger=csv"]
+    merged = with_checkpoint_config(cfg, checkpoint, typed)
     assert merged.data.synthesis.keypoint_noise_px == 15
     assert merged.data.observation.num_points == 128
-    refused = ("model.edm=false", "preset=thesis", "experiment=detector/basic", "data=synthetic", "seed=3")
     for override in (
-        *refused,
-        "data/source=embedded",
-        "~data.synthesis.distance_m",
-        "+data.more=1",
-        "sweep=demo",
+        *("model.edm=false", "preset=thesis", "experiment=detector/basic", "data=synthetic", "seed=3"),
+        *("data/source=embedded", "~data.synthesis.distance_m", "+data.more=1", "sweep=demo"),
     ):
         with pytest.raises(ValueError, match="come from the checkpoint"):
             with_checkpoint_config(cfg, checkpoint, [override])
