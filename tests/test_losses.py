@@ -14,11 +14,6 @@ def test_joint_loss_sums_over_joints_and_averages_over_the_batch():
     torch.testing.assert_close(joint_loss(pred, target), expected)
 
 
-def test_joint_loss_of_every_joint_one_decimetre_off():
-    target = torch.zeros(4, 24, 3)
-    assert joint_loss(target + torch.tensor([0.0, 0.1, 0.0]), target) == pytest.approx(24 * 0.01)
-
-
 def test_joint_loss_gradient():
     pred, target = torch.randn(2, 3, 24, 3, dtype=torch.float64)
     assert torch.autograd.gradcheck(joint_loss, (pred.requires_grad_(), target))

@@ -215,10 +215,3 @@ def test_open3ds_normals_have_unit_length_and_look_towards_the_camera(noisy_body
     normals = open3d_normals(cloud, noisy, kinect)
     np.testing.assert_allclose(np.linalg.norm(normals, axis=-1), 1, atol=1e-6)
     assert (normals * unit(cloud.points)).sum(-1).max() < 1e-6
-
-
-@pytest.mark.render
-def test_window_and_open3d_normals_agree_on_most_of_a_body(noisy_body, kinect, open3d):
-    cloud, noisy = noisy_body(0, num_points=4096)
-    difference = degrees_between(window_normals(cloud, noisy, kinect), open3d_normals(cloud, noisy, kinect))
-    assert np.median(difference) < 10

@@ -106,13 +106,6 @@ def test_pixels_come_in_random_order_and_evenly_from_the_whole_body():
         assert drawn.std() == pytest.approx(all_of_them.std(), rel=0.1)
 
 
-def test_a_body_of_one_pixel_gives_that_point_again_and_again():
-    depth = np.zeros((CAMERA.height, CAMERA.width), np.float32)
-    depth[5, 7] = 2.0
-    cloud = sample_cloud(depth, CAMERA, 10, rng())
-    assert (cloud.pixels == [7, 5]).all()
-
-
 def test_an_empty_mask_and_an_image_of_another_size_than_the_cameras_are_errors():
     with pytest.raises(ValueError, match=r"depth: the mask is empty.*check the segmentation, the depth unit"):
         sample_cloud(np.zeros((CAMERA.height, CAMERA.width), np.float32), CAMERA, 10, rng())

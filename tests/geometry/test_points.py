@@ -73,12 +73,6 @@ def test_gather_points_equals_a_loop(index_shape):
             assert torch.equal(gathered[b][place], features[b, index[b][place]])
 
 
-def test_gather_points_passes_gradients_to_each_taken_row_as_often_as_it_is_taken():
-    features = draw(2, 3, 2).requires_grad_()
-    gather_points(features, torch.tensor([[0, 0, 2], [1, 1, 1]])).sum().backward()
-    assert features.grad[..., 0].tolist() == [[2.0, 0.0, 1.0], [0.0, 3.0, 0.0]]
-
-
 # Squared distances
 
 

@@ -44,12 +44,8 @@ def test_what_is_no_depth_image_is_refused(image, tmp_path):
 
 
 def test_a_missing_file_is_named(tmp_path):
-    for name, read in (
-        ("depth", read_depth),
-        ("camera", read_camera),
-        ("keypoints", read_keypoints),
-        ("mask", read_mask),
-    ):
+    readers = {"depth": read_depth, "camera": read_camera, "keypoints": read_keypoints, "mask": read_mask}
+    for name, read in readers.items():
         with pytest.raises(FileNotFoundError, match=f"{name}: no file '.*nowhere.png'"):
             read(tmp_path / "nowhere.png")
 
@@ -104,11 +100,9 @@ def test_the_training_camera_is_read_from_the_configuration(kinect):
         ),
         ("fx: [1]\nfy: 1\ncx: 1\ncy: 1\nwidth: 9\nheight: 9", r"fx: expected a finite number.*got \[1\]"),
         ("fx: 1\nfy: wide\ncx: 1\ncy: 1\nwidth: 9\nheight: 9", "fy: expected a finite number.*got 'wide'"),
-        ("fx: 1\nfy: 1\ncx: null\ncy: 1\nwidth: 9\nheight: 9", "cx: expected a finite number.*got None"),
         ("fx: 1\nfy: 1\ncx: 1\ncy: true\nwidth: 9\nheight: 9", "cy: expected a finite number.*got True"),
         ("fx: 1\nfy: 1\ncx: 1\ncy: 1\nwidth: .inf\nheight: 9", "width: expected a finite number.*got inf"),
         ("fx: 1\nfy: 1\ncx: 1\ncy: 1\nwidth: 4.9\nheight: 9", r"width: expected a whole number.*got 4\.9"),
-        ("fx: 1\nfy: 1\ncx: 1\ncy: 1\nwidth: 9\nheight: 8.5", r"height: expected a whole number.*got 8\.5"),
         ("fx: 2001-99-99\nfy: 1", "is damaged"),
         ("fx: 1\nfy: 1\ncx: 1\ncy: 8\nwidth: 9\nheight: 5", "principal point.*lies outside.*swapped"),
         ("fx: {", "is damaged"),

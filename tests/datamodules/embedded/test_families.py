@@ -117,25 +117,12 @@ def test_squatters_bend_both_knees_and_keep_their_feet_under_them(family_poses, 
     assert (ankles[:, 2] - middle[:, 2]).abs().mean() < 0.25
 
 
-def test_lungers_feet_are_far_apart(family_poses, place):
-    joints = place(family_poses("lunge"))
-    apart = (joints["l_ankle"] - joints["r_ankle"]).norm(dim=-1)
-    assert apart.median() > 0.6
-
-
 def test_sitters_have_level_thighs_and_an_upright_trunk(family_poses, place):
     joints = place(family_poses("sit"))
     for side in SIDES:
         thigh = joints[f"{side}_knee"] - joints[f"{side}_hip"]
         assert (thigh[:, 1] / thigh.norm(dim=-1)).asin().rad2deg().abs().median() < 25
     assert trunk_elevation(joints).median() > 60
-
-
-def test_kickers_stand_on_one_leg(family_poses, place):
-    joints = place(family_poses("kick"))
-    ankles = torch.stack([joints["l_ankle"][:, 1], joints["r_ankle"][:, 1]], 1)
-    assert (ankles[:, 0] - ankles[:, 1]).abs().median() > 0.2
-    assert trunk_elevation(joints).median() > 55
 
 
 def test_kneelers_have_a_knee_lowest_or_nearly(family_poses, place):

@@ -77,11 +77,6 @@ def test_no_pose_reaches_into_itself_by_more_than_the_limit(drawn, body, offsets
     assert penetration(world, REFERENCE_OFFSETS, REFERENCE_CAPSULES).max() <= 0.05
 
 
-def test_a_tighter_limit_is_kept_too(make):
-    mixture = make(max_penetration_m=0.01)
-    assert mixture.depth(mixture.draw(np.random.default_rng(0), 100).rotmat).max() <= 0.01
-
-
 def test_all_poses_are_within_joint_limits_and_without_heading(drawn):
     torch.testing.assert_close(within_limits(drawn.rotmat), drawn.rotmat, atol=1e-9, rtol=0)
     root = drawn.rotmat[:, ROOT]
