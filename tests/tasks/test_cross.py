@@ -12,7 +12,7 @@ CONF = Path(__file__).parents[2] / "conf"
 def test_a_run_is_trained_once_and_tested_on_other_data(smoke_config, tmp_path):
     metrics = {}
     for noise_px in (0, 15):
-        cfg = smoke_config(tmp_path, f"experiment=detector/cross_{noise_px}px")
+        cfg = smoke_config(tmp_path, f"experiment=detector/cross_{noise_px}px", "callbacks.pictures=null")
         metrics[noise_px] = cross(cfg)
     assert metrics[0]["test/initial_mpjpe"] < metrics[15]["test/initial_mpjpe"]
     [run] = (tmp_path / "runs").iterdir()

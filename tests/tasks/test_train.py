@@ -104,7 +104,8 @@ def test_the_same_seed_gives_the_same_run_and_samples_whatever_the_workers(
     trained, smoke_config, tmp_path, add_callback
 ):
     metrics, run_dir = trained
-    cfg = smoke_config(tmp_path, "experiment=detector/proposed", "data.num_workers=2")
+    other = ("data.num_workers=2", "callbacks.pictures=null")
+    cfg = smoke_config(tmp_path, "experiment=detector/proposed", *other)
     add_callback(seen := Seen())
     assert train(cfg) == metrics
     ours, theirs = weights(run_dir), weights(Path(cfg.paths.run_dir))
@@ -243,7 +244,7 @@ def test_another_content_of_the_pose_file_is_another_run_and_nan_is_none(smoke_c
 
 
 def test_a_nan_loss_stops_a_run_and_says_so(smoke_config, tmp_path):
-    diverging = ("module.optimizer.lr=1e30", "trainer.max_epochs=3")
+    diverging = ("module.optimizer.lr=1e30", "trainer.max_epochs=3", "callbacks.pictures=null")
     cfg = smoke_config(tmp_path, "experiment=detector/basic", *diverging)
     with pytest.raises(FloatingPointError, match="lower the learning rate"):
         train(cfg)
