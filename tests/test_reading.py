@@ -140,7 +140,7 @@ def check_message(error):
 
 
 @pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("num_files", [100, pytest.param(5000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("num_files", [100, pytest.param(1000, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", KINDS)
 def test_a_damaged_file_is_read_as_before_or_refused(name, num_files, tmp_path):
     path, (write, read, has_checksums) = tmp_path / name, KINDS[name]
