@@ -1,6 +1,7 @@
 import dataclasses
 import itertools
 import os
+import signal
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +21,9 @@ from ljn.geometry.rotations import CAMERA_FROM_BODY, rotation_about, rotmat_to_r
 from ljn.optional import import_open3d, import_pyrender
 from ljn.render import get_renderer
 from ljn.tasks.schema import register
+
+# Tests that are started in the background begin with Ctrl-C ignored, and so would the processes that they start.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 
 if "PYTEST_XDIST_WORKER" in os.environ:
     # With several threads in each worker, they would wait for one another's cores.

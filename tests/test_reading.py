@@ -43,22 +43,14 @@ def body_fields(num_vertices=12):
 
 def checkpoint_content():
     """What a run keeps of a tiny detector."""
-    net = {
-        "_target_": "ljn.nets.simple_baseline.SimpleBaseline",
-        "channels": 8,
-        "num_blocks": 1,
-        "dropout": 0.5,
-    }
+    net = {"channels": 8, "num_blocks": 1, "dropout": 0.5}
+    net["_target_"] = "ljn.nets.simple_baseline.SimpleBaseline"
     config = {
-        "preset": {},
-        "body": {},
-        "trainer": {},
+        **{key: {} for key in ("preset", "body", "trainer")},
         "model": net,
         "module": {"_target_": "ljn.modules.joint_detector.JointDetector", "net": dict(net)},
         "data": {"camera": {"_target_": "ljn.geometry.camera.Camera", **CAMERA}},
-        "seed": 0,
-        "name": "tiny",
-        "optimized_metric": "val/mpjpe",
+        **{"seed": 0, "name": "tiny", "optimized_metric": "val/mpjpe"},
     }
     torch.manual_seed(0)
     texts = {"body_hash": "0123456789abcdef", "data_licence": "none", "run": "tiny"}
@@ -148,7 +140,7 @@ def check_message(error):
 
 
 @pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("num_files", [100, pytest.param(5000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("num_files", [100, pytest.param(1000, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", KINDS)
 def test_a_damaged_file_is_read_as_before_or_refused(name, num_files, tmp_path):
     path, (write, read, has_checksums) = tmp_path / name, KINDS[name]
@@ -237,9 +229,7 @@ YAML_MERGES = "a0: &a0 {x: 1}\n" + "".join(
         ("camera.json", lambda path: path.write_text(json.dumps({"x" * 60_000: "\ud800"}))),
         ("keypoints.json", lambda path: path.write_text(json.dumps({"people": {"x" * 5_000_000: 1}}))),
         ("keypoints.json", lambda path: path.write_text(json.dumps({"\x1b[2J" * 1_000_000: [1, 2]}))),
-        ("keypoints.json", lambda path: path.write_text(json.dumps(["x" * 5_000_000]))),
         ("keypoints.json", lambda path: path.write_text(json.dumps([["x" * 5_000_000, 1]] * 2))),
-        ("keypoints.json", lambda path: path.write_text(json.dumps([[1.5] * 1_000_000]))),
         ("keypoints.json", lambda path: path.write_text(json.dumps({"order": "x" * 5_000_000, "keypoints": []}))),
         ("keypoints.json", lambda path: path.write_text(100_000 * "[")),
         ("depth.png", lambda path: path.write_bytes(png_of_size(60_000, 60_000))),
@@ -318,17 +308,18 @@ def weight_name():
         (lambda content, config: content["state_dict"].update({3: torch.ones(1)}), "expected names, got 3"),
         (edit_state(extra=torch.ones(2)), "weights of another model"),
         (edit_state(extra=torch.eye(2).to_sparse()), "expected a tensor of plain numbers, got torch.sparse_coo"),
-        (
-            lambda content, config: content["state_dict"].update(
-                extra=torch.quantize_per_tensor(torch.ones(2), 0.1, 0, torch.qint8)
-            ),
-            "got .* of torch.qint8",
-        ),
         (edit_state(extra=torch.ones(2, dtype=torch.complex64)), "got .* of torch.complex64"),
         (edit_state(extra=torch.ones(2, device="meta")), "expected numbers that are in the file"),
         (edit_state(extra=torch.tensor([1.0, np.nan])), "extra: expected finite numbers"),
         (edit_state(extra=torch.tensor([1e300], dtype=torch.float64)), "extra: expected finite numbers"),
         (lambda content, config: content["state_dict"].clear(), "weights of another model"),
+        (lambda content, config: content.pop("ljn"), "no checkpoint that a run of this library wrote"),
+        (lambda content, config: content["ljn"].update(version=99), "written by a newer version"),
+        (lambda content, config: content["ljn"].update(version=0), "written by an older version"),
+        (lambda content, config: content["ljn"].update(version="1"), "no whole configuration"),
+        (lambda content, config: content.update(ljn={}), "no whole configuration"),
+        (lambda content, config: config.pop("body"), "no whole configuration"),
+        (edit_config(name="${oc.env:HOME}"), "no whole configuration"),
         (lambda content, config: content.update(epoch=2**40), "no whole configuration"),
         (lambda content, config: content["ljn"].update(run="x" * 5000), "no whole configuration"),
         (edit_config(name="???"), "no whole configuration"),
@@ -341,11 +332,13 @@ def weight_name():
         (edit_camera(fx=float("nan")), "focal lengths and image size must be positive"),
         (edit_camera(fx="wide"), "expected six numbers"),
         (edit_camera(width=10**9), "in all at the most"),
+        (edit_net(channels=16), r"weights of another model.*'net\."),
         (edit_net(channels=10**9), "weights of another model"),
         (edit_net(channels=10**30), ""),
         (edit_net(channels="x" * 100_000), ""),
         (edit_net(num_blocks=10**9), "a smaller one than its configuration says"),
         (edit_net(dropout=5), ""),
+        (edit_net(_target_="os.system"), r"checkpoint's config.*os\.system"),
         (edit_net(_target_="x" * 100_000), "is outside the modules"),
         (edit_net(_target_="ljn.nets..x"), "cannot be found"),
         (edit_net(_target_="ljn.geometry.camera.Camera"), ""),

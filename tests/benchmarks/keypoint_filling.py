@@ -16,6 +16,7 @@ from datamodules.sources.embedded import EmbeddedSource
 from datamodules.synthesis import DepthSynthesizer, SynthesisSettings
 from ljn.body import SMPL, load_body_models
 from ljn.body.skeleton import JOINT_INDEX, JOINT_NAMES, NUM_JOINTS, PARENTS
+from ljn.cloud.observation import ObservationRecipe
 from ljn.geometry.camera import Camera
 from ljn.pipeline.keypoints import COVARIANCE_PATH, MIN_KNOWN, ORDERS, fill_missing
 
@@ -74,9 +75,9 @@ def main() -> None:
         np.savez_compressed(COVARIANCE_PATH, covariance=covariance.astype(np.float32))
         print(f"{COVARIANCE_PATH}: {COVARIANCE_PATH.stat().st_size} bytes")
 
-    synthesizer = DepthSynthesizer(
-        source.records("test", NUM_TEST, SEED), bodies, SynthesisSettings(CAMERA, 1), (SEED, 2)
-    )
+    records = source.records("test", NUM_TEST, SEED)
+    recipe, takes = ObservationRecipe(1), ("keypoints",)
+    synthesizer = DepthSynthesizer(records, bodies, CAMERA, SynthesisSettings(), recipe, takes, (SEED, 2))
     keys = [(0, index) for index in range(NUM_TEST)]
     chunks = [keys[start : start + CHUNK] for start in range(0, NUM_TEST, CHUNK)]
     keypoints = np.concatenate([synthesizer.batch(chunk)["true_keypoints"].numpy() for chunk in chunks])

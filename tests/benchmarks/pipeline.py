@@ -22,6 +22,7 @@ from datamodules.synthesis import DepthSynthesizer, SynthesisSettings
 from datamodules.synthetic import SynthesizedSamples
 from ljn.body import SMPL, SMPLOutput, load_body_models
 from ljn.cloud.normals import get_normal_estimator
+from ljn.cloud.observation import ObservationRecipe
 from ljn.cloud.sampling import sample_cloud
 from ljn.geometry.camera import Camera
 from ljn.geometry.rotations import CAMERA_FROM_BODY
@@ -164,27 +165,17 @@ def main() -> None:
     columns = [torch.from_numpy(c[:BATCH]) for c in (records.pose, records.betas, records.gender)]
 
     # First, while this process has neither a GL context nor Open3D's threads: the workers are forked from it.
-    combinations = [
-        (renderer, normals)
-        for renderer, normals in (
-            ("zbuffer", "window"),
-            ("zbuffer", "knn"),
-            ("zbuffer", "open3d"),
-            ("pyrender", "open3d"),
-        )
-        if renderer in renderers and normals in estimators
-    ]
+    pairs = (("zbuffer", "window"), ("zbuffer", "knn"), ("zbuffer", "open3d"), ("pyrender", "open3d"))
+    pairs = [pair for pair in pairs if pair[0] in renderers and pair[1] in estimators]
     for title, kind in (("with the body", DepthSynthesizer), ("without the body", OfPosedBodies)):
         time_loaders(
             f"whole samples {title}, {NUM_POINTS} points, 2 workers",
             {
                 f"{renderer} + {normals} normals": kind(
-                    records,
-                    bodies,
-                    SynthesisSettings(CAMERA, NUM_POINTS, renderer=renderer, normals=normals),
-                    (0, 0),
+                    *(records, bodies, CAMERA, SynthesisSettings(renderer=renderer)),
+                    *(ObservationRecipe(NUM_POINTS, normals), ("points",), (0, 0)),
                 )
-                for renderer, normals in combinations
+                for renderer, normals in pairs
             },
         )
 

@@ -217,15 +217,7 @@ def rows(scorer: Scorer) -> Iterator[list[str]]:
             "",
             deepest(mixture, poses),
         ]
-    yield [
-        "real poses of all other subjects",
-        str(NUM_POOL),
-        *scorer.coverage_by_other_people(),
-        "",
-        "",
-        "",
-        "",
-    ]
+    yield ["real poses of all other subjects", str(NUM_POOL), *scorer.coverage_by_other_people(), *[""] * 4]
 
 
 def print_subjects(scorer: Scorer) -> None:
@@ -278,11 +270,8 @@ def draw_sheet(records: PoseRecords) -> Image.Image:
     pose = torch.from_numpy(records.pose).double()
     turn, tilt = (torch.tensor(math.radians(angle), dtype=torch.float64) for angle in (35.0, 5.0))
     root = rotmat_to_rotvec(rotation_about("z", turn) @ rotvec_to_rotmat(pose[:, :3]))
-    vertices = smpl(
-        torch.cat([root, pose[:, 3:]], -1),
-        torch.from_numpy(records.betas).double(),
-        torch.from_numpy(records.gender),
-    ).vertices
+    pose, betas = torch.cat([root, pose[:, 3:]], -1), torch.from_numpy(records.betas).double()
+    vertices = smpl(pose, betas, torch.from_numpy(records.gender)).vertices
     vertices[..., :2] -= (vertices[..., :2].amin(1) + vertices[..., :2].amax(1))[:, None] / 2
     vertices[..., 2] -= vertices[..., 2].amin(-1)[:, None]
     # Seen from a little above, along x, from the height of a standing person's hips.

@@ -41,9 +41,8 @@ def main() -> None:
     coco = coco[list(COCO_OF_MHR)]
     fx, fy, cx, cy = intrinsics.tolist()
     camera = Camera(fx, fy, cx, cy, width=round(2 * cx), height=round(2 * cy))
-    depth = get_renderer()(torch.from_numpy(vertices)[None], torch.from_numpy(faces).long(), camera)[
-        0
-    ].numpy()
+    meshes = torch.from_numpy(vertices)[None], torch.from_numpy(faces).long()
+    depth = get_renderer()(*meshes, camera)[0].numpy()
     depth = add_depth_noise(depth, DEPTH_NOISE_M, np.random.default_rng(0))
     keypoints = project(torch.from_numpy(coco), camera.intrinsics()).numpy()
 
@@ -74,9 +73,8 @@ def mesh_joints(pipeline: Pipeline, found: Prediction) -> np.ndarray:
     assert pipeline.regressor is not None
     assert found.pose is not None
     assert found.betas is not None
-    joints = pipeline.regressor.module.body(
-        torch.from_numpy(found.pose), torch.from_numpy(found.betas)
-    ).joints
+    body = pipeline.regressor.module.body
+    joints = body(torch.from_numpy(found.pose), torch.from_numpy(found.betas)).joints
     return place_at_root(joints, joints[ROOT], torch.from_numpy(found.joints[ROOT])).numpy()
 
 

@@ -8,12 +8,9 @@ import types
 import numpy as np
 import pytest
 import scipy.sparse
-import torch
 
 from ljn.body import BodyModel, load_body_model, load_body_models
-from ljn.body.files import GENDERS
 from ljn.body.skeleton import PARENTS
-from ljn.body.smpl import SMPL
 
 NUM_VERTICES = 30
 
@@ -118,8 +115,12 @@ def write_official_pickle(path, fields):
         "J": Ch(np.zeros((24, 3))),
         "pose_training_info": {"gender": "f", "scale": np.float64(1.5), "names": np.array(["a", "bc"])},
     }
+    return write_python2(path, official)
+
+
+def write_python2(path, content):
     with open(path, "wb") as file:
-        Python2Pickler(file).dump(official)
+        Python2Pickler(file).dump(content)
     return path
 
 
@@ -133,18 +134,18 @@ def write_npz(path, fields):
     return path
 
 
+def write(path, fields):
+    return {".npz": write_npz, ".pkl": write_pickle}[path.suffix](path, fields)
+
+
 def globals_named(data):
     return {argument for opcode, argument, _ in pickletools.genops(data) if opcode.name == "GLOBAL"}
 
 
 def test_the_embedded_body_is_complete_and_read_only():
     model = load_body_model()
-    assert model.v_template.shape == (6890, 3)
     assert model.posedirs.shape == (6890, 3, 207)
-    assert model.faces.shape == (13776, 3)
-    assert model.faces.dtype == np.int64
-    assert model.weights.dtype == np.float32
-    assert model.gender == "neutral"
+    assert (model.faces.dtype, model.weights.dtype, model.gender) == (np.int64, np.float32, "neutral")
     with pytest.raises(ValueError, match="read-only"):
         model.weights[0] = 0
 
@@ -181,8 +182,7 @@ def test_chumpy_selections_and_old_csr_load(tmp_path):
     expected = load_body_model(write_npz(tmp_path / "body.npz", fields))
     fields["shapedirs"] = Select(Ch(fields["shapedirs"]), np.s_[:, :, :10])
     fields["J_regressor"] = OldCsr(scipy.sparse.csr_matrix(fields["J_regressor"]))
-    with open(tmp_path / "body.pkl", "wb") as file:
-        Python2Pickler(file).dump(fields)
+    write_python2(tmp_path / "body.pkl", fields)
     assert load_body_model(tmp_path / "body.pkl").hash == expected.hash
 
 
@@ -197,12 +197,8 @@ def test_big_endian_and_single_precision_arrays_give_the_same_hash(tmp_path):
 
 
 def test_the_hash_tells_bodies_apart_and_does_not_change_between_versions():
-    arrays = smpl_fields()
-    arrays = {
-        key: np.round(value, 2)
-        for key, value in arrays.items()
-        if key in ("v_template", "shapedirs", "posedirs")
-    }
+    fields = smpl_fields()
+    arrays = {key: np.round(fields[key], 2) for key in ("v_template", "shapedirs", "posedirs")}
     fixed = {
         "J_regressor": np.eye(24, NUM_VERTICES),
         "weights": np.eye(NUM_VERTICES, 24) + (np.arange(NUM_VERTICES) >= 24)[:, None] / 24,
@@ -219,22 +215,6 @@ def test_more_than_ten_shape_components_are_cut(tmp_path):
     fields = smpl_fields(num_betas=300)
     model = load_body_model(write_npz(tmp_path / "body.npz", fields))
     assert np.array_equal(model.shapedirs, fields["shapedirs"][:, :, :10].astype(np.float32))
-
-
-def test_the_official_form_gives_the_vertices_and_joints_of_smplx(tmp_path):
-    smplx = pytest.importorskip("smplx", reason="smplx is not installed")
-    fields = embedded_fields()
-    layer = SMPL.load(write_official_pickle(tmp_path / "official.pkl", fields)).double()
-    fields["J_regressor"] = scipy.sparse.csc_matrix(fields["J_regressor"])
-    plain = write_pickle(tmp_path / "plain.pkl", fields)
-    reference = smplx.SMPL(str(plain), batch_size=4, dtype=torch.float64)
-    generator = torch.Generator().manual_seed(0)
-    pose = torch.randn(4, 72, dtype=torch.float64, generator=generator)
-    betas = 2 * torch.randn(4, 10, dtype=torch.float64, generator=generator)
-    expected = reference(betas=betas, global_orient=pose[:, :3], body_pose=pose[:, 3:])
-    output = layer(pose, betas)
-    torch.testing.assert_close(output.vertices, expected.vertices, atol=1e-5, rtol=0)
-    torch.testing.assert_close(output.joints, expected.joints[:, :24], atol=1e-5, rtol=0)
 
 
 # --- Pickles that try to do harm ---
@@ -292,11 +272,6 @@ def test_no_way_of_naming_a_global_leads_round_the_list(tmp_path, stream, name):
         load_body_model(tmp_path / "evil.pkl")
 
 
-def object_dtype_with_plain_flags():
-    """A dtype whose pickled state says that raw bytes are Python objects."""
-    return Call(np.dtype, "V8", False, True), (3, "|", None, ("a",), {"a": (np.dtype("O"), 0)}, 8, 1, 0)
-
-
 class Built:
     """Makes an object by a call and then sets its state."""
 
@@ -307,8 +282,11 @@ class Built:
         return (*self.call.call, self.state)
 
 
+# A dtype whose pickled state says that raw bytes are Python objects.
+OBJECTS = Built(Call(np.dtype, "V8", False, True), (3, "|", None, ("a",), {"a": (np.dtype("O"), 0)}, 8, 1, 0))
 RECONSTRUCT = np.zeros(1).__reduce__()[0]
 SCALAR = np.float64(1).__reduce__()[0]
+EMPTY = Call(RECONSTRUCT, np.ndarray, (0,), b"b")
 TERABYTES = 10**13
 
 
@@ -319,13 +297,10 @@ TERABYTES = 10**13
         Call(np.ndarray, (TERABYTES,)),
         Call(bytearray, TERABYTES),
         Call(SCALAR, np.dtype("O"), pickle.dumps(Call(os.abort))),
-        Built(Call(RECONSTRUCT, np.ndarray, (0,), b"b"), (1, (TERABYTES,), np.dtype("f8"), False, b"")),
-        Built(Call(RECONSTRUCT, np.ndarray, (0,), b"b"), (1, (4,), np.dtype("O"), False, [1, 2, 3, 4])),
-        Built(Call(RECONSTRUCT, np.ndarray, (0,), b"b"), (1, (10**9, "a" * 100), np.dtype("f8"), False, b"")),
-        Built(
-            Call(RECONSTRUCT, np.ndarray, (0,), b"b"),
-            (1, (1,), Built(*object_dtype_with_plain_flags()), False, b"\x01" * 8),
-        ),
+        Built(EMPTY, (1, (TERABYTES,), np.dtype("f8"), False, b"")),
+        Built(EMPTY, (1, (4,), np.dtype("O"), False, [1, 2, 3, 4])),
+        Built(EMPTY, (1, (10**9, "a" * 100), np.dtype("f8"), False, b"")),
+        Built(EMPTY, (1, (1,), OBJECTS, False, b"\x01" * 8)),
         Call(copyreg._reconstructor, dict, object, None),
         Call(copyreg._reconstructor, list, list, [1]),
     ],
@@ -347,16 +322,13 @@ def test_a_pickle_cannot_change_the_classes_that_stand_for_its_names(tmp_path, n
     with pytest.raises(ValueError, match="cannot be read"):
         load_body_model(tmp_path / "evil.pkl")
     fields = {**smpl_fields(), "shapedirs": Ch(smpl_fields()["shapedirs"])}
-    with open(tmp_path / "good.pkl", "wb") as file:
-        Python2Pickler(file).dump(fields)
-    load_body_model(tmp_path / "good.pkl")
+    load_body_model(write_python2(tmp_path / "good.pkl", fields))
 
 
 def test_a_record_keeps_a_state_that_names_its_class(tmp_path):
     sneaky = Ch(np.zeros((NUM_VERTICES, 24)))
     sneaky.__dict__["__class__"] = dict
-    with open(tmp_path / "evil.pkl", "wb") as file:
-        Python2Pickler(file).dump({**smpl_fields(), "weights": sneaky})
+    write_python2(tmp_path / "evil.pkl", {**smpl_fields(), "weights": sneaky})
     with pytest.raises(ValueError, match="rows of weights should each sum to 1"):
         load_body_model(tmp_path / "evil.pkl")
 
@@ -376,8 +348,7 @@ def test_a_forged_sparse_matrix_is_refused_without_being_made(tmp_path, changes)
     fields = smpl_fields()
     matrix = OldCsc(scipy.sparse.csc_matrix(fields["J_regressor"]))
     vars(matrix).update(changes)
-    with open(tmp_path / "evil.pkl", "wb") as file:
-        Python2Pickler(file).dump({**fields, "J_regressor": matrix})
+    write_python2(tmp_path / "evil.pkl", {**fields, "J_regressor": matrix})
     with pytest.raises(ValueError, match=r"evil\.pkl: (cannot be read|.*sum to 1|J_regressor should)"):
         load_body_model(tmp_path / "evil.pkl")
 
@@ -390,8 +361,7 @@ def test_chumpy_arrays_of_many_levels_are_refused(tmp_path):
         below, tower = tower, Select(Ch(np.zeros(3)), np.s_[:])
         tower.a = tower.idxs = below
     for shapedirs in (loop, tower):
-        with open(tmp_path / "evil.pkl", "wb") as file:
-            Python2Pickler(file).dump({**smpl_fields(), "shapedirs": shapedirs})
+        write_python2(tmp_path / "evil.pkl", {**smpl_fields(), "shapedirs": shapedirs})
         with pytest.raises(ValueError, match="shapedirs made from arrays in more than 5 levels"):
             load_body_model(tmp_path / "evil.pkl")
 
@@ -405,23 +375,14 @@ def test_a_huge_memo_number_is_refused(tmp_path):
 # --- Files that are damaged, missing or something else ---
 
 
-@pytest.mark.parametrize("kept", [0.0, 0.01, 0.5, 0.999])
+@pytest.mark.parametrize("kept", [0.0, 0.5, 0.999])
 @pytest.mark.parametrize("suffix", [".npz", ".pkl"])
 def test_a_truncated_file_is_called_damaged(tmp_path, suffix, kept):
     path = tmp_path / f"body{suffix}"
-    (write_npz if suffix == ".npz" else write_pickle)(path, smpl_fields())
+    write(path, smpl_fields())
     data = path.read_bytes()
     path.write_bytes(data[: int(kept * len(data))])
     with pytest.raises(ValueError, match=rf"body\{suffix}: cannot be read .*damaged"):
-        load_body_model(path)
-
-
-def test_a_flipped_byte_in_an_archive_is_called_damaged(tmp_path):
-    path = write_npz(tmp_path / "body.npz", smpl_fields())
-    data = bytearray(path.read_bytes())
-    data[len(data) // 2] ^= 0xFF
-    path.write_bytes(data)
-    with pytest.raises(ValueError, match="damaged"):
         load_body_model(path)
 
 
@@ -429,11 +390,6 @@ def test_python_objects_in_an_archive_are_refused(tmp_path):
     path = write_npz(tmp_path / "body.npz", {**smpl_fields(), "weights": np.array([{}], object)})
     with pytest.raises(ValueError, match=r"holds object of shape .*expected numbers or text"):
         load_body_model(path)
-
-
-def test_a_missing_file_names_the_embedded_body(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"no body model file .*none\.pkl.*embedded body"):
-        load_body_model(tmp_path / "none.pkl")
 
 
 def test_a_gender_that_is_not_embedded_is_refused_with_those_that_are(tmp_path, monkeypatch):
@@ -444,8 +400,9 @@ def test_a_gender_that_is_not_embedded_is_refused_with_those_that_are(tmp_path, 
         load_body_model(gender="male")
 
 
-def test_an_unknown_gender_or_file_type_is_refused(tmp_path):
-    assert list(GENDERS.values()) == [0, 1, 2]
+def test_an_unknown_gender_file_or_type_of_file_is_refused(tmp_path):
+    with pytest.raises(FileNotFoundError, match=r"no body model file .*none\.pkl.*embedded body"):
+        load_body_model(tmp_path / "none.pkl")
     with pytest.raises(ValueError, match="gender: expected one of female, male, neutral, got 'm'"):
         load_body_model(gender="m")
     (tmp_path / "body.mat").touch()
@@ -464,20 +421,15 @@ def with_value(array, index, value):
     ("key", "change", "message"),
     [
         ("v_template", lambda a: a[:, :2], r"v_template should have shape \(30, 3\), got \(30, 2\)"),
-        ("v_template", lambda a: a[:0], r"shapedirs should have shape \(0, 3, 10\)"),
         ("v_template", lambda a: with_value(a, (3, 1), np.nan), "v_template should be finite"),
-        ("v_template", lambda a: with_value(a, (3, 1), 1e300), "v_template should be finite"),
         ("v_template", lambda a: a.astype("U8"), "real numbers, got dtype <U8|no plain numbers"),
         ("shapedirs", lambda a: a[:, :, :9], r"shapedirs should have shape \(V, 3, 10\) or.*\(30, 3, 9\)"),
-        ("shapedirs", lambda a: a.reshape(-1, 10), r"shapedirs should have shape .* got \(90, 10\)"),
         ("posedirs", lambda a: a[:, :, :9], r"posedirs should have shape \(30, 3, 207\), got \(30, 3, 9\)"),
-        ("posedirs", lambda a: with_value(a, (0, 0, 0), np.inf), "posedirs should be finite"),
         ("J_regressor", lambda a: a.T, r"J_regressor should have shape \(24, 30\), got \(30, 24\)"),
         ("J_regressor", lambda a: 1.01 * a, "rows of J_regressor should each sum to 1, got sums from 1.01"),
         ("weights", lambda a: with_value(a, 5, 0.0), "rows of weights should each sum to 1, got sums from 0"),
         ("f", lambda a: a + 1, "faces should index the 30 vertices, got indices from 0 to 30"),
         ("f", lambda a: a.astype(np.int64) - 1, "faces should index the 30 vertices, got indices from -1"),
-        ("f", lambda a: a[:, :2], r"faces should have shape \(50, 3\)"),
         ("kintree_table", lambda a: with_value(a, (0, 5), 1), "kintree_table should .* begin with"),
         ("kintree_table", lambda a: a[:, :22], r"kintree_table should have .* got shape \(2, 22\)"),
     ],
@@ -486,19 +438,13 @@ def test_a_wrong_array_is_named_with_what_was_expected(tmp_path, suffix, key, ch
     fields = smpl_fields()
     fields[key] = change(fields[key])
     path = tmp_path / f"body{suffix}"
-    (write_npz if suffix == ".npz" else write_pickle)(path, fields)
+    write(path, fields)
     with pytest.raises(ValueError, match=rf"body\{suffix}: .*({message})"):
         load_body_model(path)
-
-
-@pytest.mark.parametrize("suffix", [".npz", ".pkl"])
-def test_a_missing_array_is_named(tmp_path, suffix):
     fields = smpl_fields()
     del fields["posedirs"]
-    path = tmp_path / f"body{suffix}"
-    (write_npz if suffix == ".npz" else write_pickle)(path, fields)
     with pytest.raises(ValueError, match="missing: posedirs"):
-        load_body_model(path)
+        load_body_model(write(path, fields))
 
 
 def test_a_pickle_of_something_else_is_refused(tmp_path):
@@ -509,12 +455,6 @@ def test_a_pickle_of_something_else_is_refused(tmp_path):
 
 
 # Bodies of several genders
-
-
-def test_embedded_bodies_come_in_the_order_asked_for():
-    bodies = load_body_models(None, ["male", "neutral", "female"])
-    assert [body.gender for body in bodies] == ["male", "neutral", "female"]
-    assert len({body.hash for body in bodies}) == 3
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ from ljn.body.kinematics import (
     without_heading,
     world_rotations,
 )
-from ljn.body.skeleton import MIRROR, ROOT
+from ljn.body.skeleton import MIRROR
 from ljn.geometry.rotations import rotation_about, rotmat_to_rotvec, rotvec_to_rotmat
 
 DTYPE = torch.float64
@@ -65,7 +65,3 @@ def test_a_backward_lean_past_the_vertical_makes_no_jump():
     turned = rotation_about("y", torch.tensor(0.3, dtype=DTYPE)) @ lean
     one, other = without_heading(turned)
     assert math.degrees(rotmat_to_rotvec(one.mT @ other).norm()) < 0.3
-
-
-def test_offsets_start_at_the_root(offsets):
-    assert offsets[ROOT].abs().max() == 0

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from ljn.body import GENDERS, SMPL, BodyModel, load_body_model
-from ljn.body.skeleton import LEVELS, MIRROR, NUM_JOINTS, PARENTS
+from ljn.body.skeleton import NUM_JOINTS, PARENTS
 from ljn.geometry.rotations import rotvec_to_rotmat
 
 DTYPE = torch.float64
@@ -103,31 +103,6 @@ def test_the_rest_pose_is_the_shaped_template_with_its_regressed_joints(embedded
     torch.testing.assert_close(layer.rest_joints(betas), output.joints, atol=1e-6, rtol=0)
 
 
-def test_the_first_rotation_turns_the_body_about_its_unmoved_root(layer):
-    pose, betas = draw(dtype=torch.float32)
-    unturned = layer(torch.cat([torch.zeros(3), pose[3:]]), betas)
-    output = layer(pose, betas)
-    root, rotmat = layer.rest_joints(betas)[0], rotvec_to_rotmat(pose[:3])
-    torch.testing.assert_close(output.joints[0], root)
-    for turned, still in zip(output, unturned):
-        torch.testing.assert_close(turned, (still - root) @ rotmat.T + root, atol=2e-6, rtol=0)
-
-
-def test_a_joint_moves_only_what_hangs_from_it(layer):
-    pose, betas = torch.zeros(72), torch.zeros(10)
-    pose[3 * LEVELS[4][1] :][:3] = torch.tensor([0.0, 0.5, 0.5])
-    moved = (layer(pose, betas).joints - layer.rest_joints(betas)).norm(dim=-1) > 1e-4
-    descends = [False] * NUM_JOINTS
-    for joint, parent in enumerate(PARENTS):
-        descends[joint] = parent >= 0 and (parent == LEVELS[4][1] or descends[parent])
-    assert moved.tolist() == descends
-
-
-def test_mirror_pairs_of_the_embedded_body_mirror_each_other(layer):
-    joints = layer.rest_joints(torch.zeros(10))
-    torch.testing.assert_close(joints[list(MIRROR)] * torch.tensor([-1, 1, 1]), joints, atol=1e-3, rtol=0)
-
-
 @pytest.mark.parametrize("batch", [(), (1,), (5,), (2, 3), (2, 1, 2), (0,), (3, 0)])
 def test_any_leading_shape_equals_sample_by_sample(batch):
     layer = SMPL([tiny_body("female", 1), tiny_body("male", 2)]).double()
@@ -173,32 +148,6 @@ def test_gradients_of_pose_and_shape_are_right(scale):
     assert torch.autograd.gradcheck(layer, (pose.requires_grad_(), betas.requires_grad_()), fast_mode=True)
 
 
-def test_gradients_are_right_on_the_embedded_body(embedded):
-    layer = SMPL(embedded).double()
-    pose, betas = draw()
-    pose[:54] *= 0.5
-
-    def some_coordinates(arm, betas):
-        return layer(torch.cat([pose[:54], arm, pose[60:]]), betas).vertices[::1500]
-
-    assert torch.autograd.gradcheck(
-        some_coordinates, (pose[54:60].clone().requires_grad_(), betas.requires_grad_()), fast_mode=True
-    )
-
-
-def test_gradients_are_finite_at_the_rest_pose(layer):
-    pose, betas = torch.zeros(2, 72, requires_grad=True), torch.zeros(2, 10, requires_grad=True)
-    layer(pose, betas).vertices.square().sum().backward()
-    assert pose.grad.isfinite().all()
-    assert pose.grad.abs().sum() > 0
-
-
-def test_single_precision_is_within_a_hundredth_of_a_millimetre(embedded, layer):
-    pose, betas = draw(8)
-    exact, output = SMPL(embedded).double()(pose, betas), layer(pose.float(), betas.float())
-    torch.testing.assert_close(output.vertices.double(), exact.vertices, atol=1e-5, rtol=0)
-
-
 def test_autocast_does_not_touch_the_body():
     layer = SMPL(tiny_body())
     pose, betas = draw(4, dtype=torch.float32)
@@ -215,9 +164,7 @@ def test_no_part_of_a_body_is_in_the_state_dict(layer):
 
 
 def test_the_layer_knows_its_mesh_genders_and_hashes(embedded, layer):
-    assert layer.num_vertices == 6890
-    assert layer.faces.dtype == torch.long
-    assert layer.faces.tolist() == embedded.faces.tolist()
+    np.testing.assert_array_equal(layer.faces, embedded.faces)
     assert (layer.hash, layer.genders) == (embedded.hash, ("neutral",))
     assert SMPL.load().hash == embedded.hash
     female, male = tiny_body("female", 1), tiny_body("male", 2)
@@ -227,16 +174,12 @@ def test_the_layer_knows_its_mesh_genders_and_hashes(embedded, layer):
 
 
 def test_bodies_of_one_gender_or_of_different_meshes_do_not_mix():
-    with pytest.raises(
-        ValueError, match=r"models: expected one body for each gender, got genders \('male', 'male'\)"
-    ):
-        SMPL([tiny_body("male"), tiny_body("male")])
-    with pytest.raises(ValueError, match="models: expected one body for each gender"):
-        SMPL([])
-    with pytest.raises(ValueError, match="models: expected bodies with the same faces"):
-        SMPL([tiny_body("male"), tiny_body("female", faces=((0, 1, 3),))])
-    with pytest.raises(ValueError, match="models: expected bodies with the same faces"):
-        SMPL([tiny_body("male"), tiny_body("female", num_vertices=10)])
+    for others in ([tiny_body("male")] * 2, []):
+        with pytest.raises(ValueError, match="models: expected one body for each gender, got genders"):
+            SMPL(others)
+    for other in (tiny_body("female", faces=((0, 1, 3),)), tiny_body("female", num_vertices=10)):
+        with pytest.raises(ValueError, match="models: expected bodies with the same faces"):
+            SMPL([tiny_body("male"), other])
 
 
 def test_a_gender_must_be_given_and_loaded():
@@ -244,16 +187,10 @@ def test_a_gender_must_be_given_and_loaded():
     two = SMPL([tiny_body("female"), tiny_body("male", 1)]).double()
     with pytest.raises(ValueError, match="gender: expected codes, since several bodies are loaded"):
         two(pose, betas)
-    with pytest.raises(
-        ValueError, match=r"gender: expected codes of loaded bodies, 0 \(female\), 1 \(male\); got \[1, 2\]"
-    ):
+    with pytest.raises(ValueError, match=r"of loaded bodies, 0 \(female\), 1 \(male\); got \[1, 2\]"):
         two(pose, betas, torch.tensor([1, 2]))
     one = SMPL(tiny_body("neutral")).double()
     assert torch.equal(one(pose, betas).vertices, one(pose, betas, torch.tensor([2, 2])).vertices)
-    with pytest.raises(
-        ValueError, match=r"gender: expected codes of loaded bodies, 2 \(neutral\); got \[0\]"
-    ):
-        one(pose, betas, torch.tensor([0, 0]))
 
 
 @pytest.mark.parametrize(
@@ -261,7 +198,6 @@ def test_a_gender_must_be_given_and_loaded():
     [
         (((2, 24, 3), (2, 10)), r"pose: expected shape \(2, 24, 72\), got \(2, 24, 3\)"),
         (((2, 72), (2, 16)), r"betas: expected shape \(2, 10\), got \(2, 16\)"),
-        (((2, 72), (10,)), r"betas: expected shape \(2, 10\), got \(10,\)"),
         (((2, 72), (2, 10), (2, 1)), r"gender: expected shape \(2,\), got \(2, 1\)"),
         (((), (10,)), r"pose: expected shape \(72,\), got \(\)"),
     ],
@@ -269,9 +205,6 @@ def test_a_gender_must_be_given_and_loaded():
 def test_a_wrong_shape_is_named(shapes, message):
     with pytest.raises(ValueError, match=message):
         SMPL(tiny_body())(*(torch.zeros(shape) for shape in shapes))
-
-
-def test_rest_joints_check_their_shape():
     with pytest.raises(ValueError, match=r"betas: expected shape \(4, 10\), got \(4, 72\)"):
         SMPL(tiny_body()).rest_joints(torch.zeros(4, 72))
 

@@ -54,28 +54,6 @@ def test_a_keypoint_keeps_its_place_in_the_image():
     np.testing.assert_allclose(project(lifted, CAMERA.intrinsics()).numpy(), keypoints, atol=1e-3)
 
 
-@pytest.mark.parametrize(
-    ("keypoint", "nearest"),
-    [
-        ((0.0, 0.0), 1.0),
-        ((31.0, 23.0), 2.0),
-        ((-100.0, -50.0), 1.0),
-        ((500.0, 11.0), 2.0),
-        ((16.0, 900.0), 2.0),
-        ((10.4, 3.0), 1.0),
-    ],
-)
-def test_two_pixels_share_the_plane_between_them(keypoint, nearest):
-    depth = image_with((3, 2, 1.0), (28, 20, 2.0))
-    assert lift_keypoints(np.array([keypoint]), depth, CAMERA)[0, 2] == nearest
-
-
-def test_nearest_is_measured_in_both_directions_not_row_by_row():
-    # In the keypoint's own row a pixel at 6, two rows up one at sqrt(5).
-    depth = image_with((16, 10, 1.0), (11, 8, 2.0))
-    assert lift_keypoints(np.array([[10.0, 10.0]]), depth, CAMERA)[0, 2] == 2.0
-
-
 def test_keypoints_do_not_touch_each_other():
     rng = np.random.default_rng(3)
     depth, keypoints = random_image(rng, 0.02), rng.uniform(0, 24, (10, 2))

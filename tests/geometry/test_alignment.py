@@ -37,23 +37,6 @@ def test_undoes_any_similarity():
         torch.testing.assert_close(procrustes_align(source, target), target)
 
 
-def test_result_does_not_depend_on_a_similarity_of_the_source():
-    source, target = random_points(24, seed=1), random_points(24, seed=2)
-    moved = 2.5 * source @ random_rotation().T + random_points(1, seed=3)
-    torch.testing.assert_close(procrustes_align(moved, target), procrustes_align(source, target))
-
-
-def test_small_changes_of_the_transform_do_not_improve_the_fit():
-    source, target = random_points(24, seed=1), random_points(24, seed=2)
-    aligned = procrustes_align(source, target)
-    best = (aligned - target).square().sum()
-    for seed in range(20):
-        rng = np.random.default_rng(seed)
-        turn = torch.from_numpy(Rotation.from_rotvec(0.01 * rng.normal(size=3)).as_matrix())
-        moved = (1 + 0.01 * rng.normal()) * aligned @ turn.T + 0.01 * torch.from_numpy(rng.normal(size=3))
-        assert (moved - target).square().sum() > best
-
-
 def test_a_mirror_image_is_not_reflected_back():
     target = random_points(24)
     mirrored = target * torch.tensor([-1.0, 1.0, 1.0])
@@ -83,11 +66,6 @@ def test_collinear_and_planar_points_align():
     for target in (line, plane):
         source = 3 * target @ random_rotation().T + 5
         torch.testing.assert_close(procrustes_align(source, target), target)
-
-
-def test_one_point_moves_onto_the_target():
-    source, target = random_points(5, 1, seed=1), random_points(5, 1, seed=2)
-    torch.testing.assert_close(procrustes_align(source, target), target)
 
 
 @pytest.mark.parametrize("value", [torch.nan, torch.inf])

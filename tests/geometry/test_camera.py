@@ -31,48 +31,17 @@ def test_projection_inverts_back_projection_with_a_camera_for_each_sample():
 
 def test_projection_follows_the_pinhole_formula(kinect):
     x, y, z = 0.3, -0.2, 2.0
-    u, v = project(torch.tensor([[x, y, z]], dtype=torch.float64), kinect.intrinsics(torch.float64))[
-        0
-    ].tolist()
-    assert u == pytest.approx(kinect.fx * x / z + kinect.cx)
-    assert v == pytest.approx(kinect.fy * y / z + kinect.cy)
-
-
-def test_the_optical_axis_meets_the_principal_point(kinect):
-    pixel = project(torch.tensor([[0.0, 0.0, 2.7]]), kinect.intrinsics())[0]
-    torch.testing.assert_close(pixel, torch.tensor([kinect.cx, kinect.cy]))
-
-
-def test_right_and_down_in_space_are_right_and_down_in_the_image(kinect):
-    centre, right, down = project(
-        torch.tensor([[0.0, 0, 2], [0.1, 0, 2], [0, 0.1, 2]]), kinect.intrinsics()
+    [pixel] = project(
+        torch.tensor([[x, y, z]], dtype=torch.float64), kinect.intrinsics(torch.float64)
     ).tolist()
-    assert right[0] > centre[0]
-    assert right[1] == centre[1]
-    assert down[1] > centre[1]
-    assert down[0] == centre[0]
-
-
-def test_moving_a_point_along_its_ray_leaves_its_pixel(kinect):
-    points = draw_points(11)
-    intrinsics = kinect.intrinsics(torch.float64)
-    torch.testing.assert_close(project(2.5 * points, intrinsics), project(points, intrinsics))
-
-
-def test_back_projection_takes_planar_depth_not_the_length_of_the_ray(kinect):
-    corner = back_project(torch.tensor([[0.0, 0.0]]), torch.tensor([2.0]), kinect.intrinsics())[0]
-    assert corner[2] == 2.0
-    assert corner.norm() > 2.5
+    assert pixel == pytest.approx([kinect.fx * x / z + kinect.cx, kinect.fy * y / z + kinect.cy])
 
 
 def test_projection_and_back_projection_have_correct_gradients(kinect):
     points = draw_points(4).requires_grad_()
     intrinsics = kinect.intrinsics(torch.float64).requires_grad_()
     assert torch.autograd.gradcheck(project, (points, intrinsics))
-    pixels, depth = (
-        project(points, intrinsics).detach().requires_grad_(),
-        points[:, 2].detach().requires_grad_(),
-    )
+    pixels, depth = (x.detach().requires_grad_() for x in (project(points, intrinsics), points[:, 2]))
     assert torch.autograd.gradcheck(back_project, (pixels, depth, intrinsics))
 
 
@@ -80,11 +49,6 @@ def test_intrinsics_come_in_the_order_of_the_batch_contract(kinect):
     expected = [kinect.fx, kinect.fy, kinect.cx, kinect.cy]
     assert kinect.intrinsics(torch.float64).tolist() == expected
     assert kinect.intrinsics().dtype == torch.float32
-
-
-def test_a_camera_cannot_be_changed(kinect):
-    with pytest.raises(dataclasses.FrozenInstanceError):
-        kinect.fx = 1.0
 
 
 @pytest.mark.parametrize("name", ["fx", "fy", "width", "height"])

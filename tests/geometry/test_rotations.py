@@ -32,9 +32,8 @@ def random_rotvecs(*shape, scale=1.5, dtype=DTYPE):
 @pytest.mark.parametrize("axis", AXES)
 def test_rotmat_equals_scipy(axis, angle):
     rotvec = angle * torch.tensor(axis, dtype=DTYPE)
-    np.testing.assert_allclose(
-        rotvec_to_rotmat(rotvec), Rotation.from_rotvec(rotvec.numpy()).as_matrix(), atol=2e-15
-    )
+    expected = Rotation.from_rotvec(rotvec.numpy()).as_matrix()
+    np.testing.assert_allclose(rotvec_to_rotmat(rotvec), expected, atol=2e-15)
 
 
 @pytest.mark.parametrize("angle", ANGLES)
@@ -54,12 +53,6 @@ def test_round_trip_of_many_rotations_keeps_the_matrix_and_batch_shape(dtype, to
     assert rotvec.shape == (50, 40, 3)
     assert rotvec.norm(dim=-1).max() <= math.pi + tolerance
     torch.testing.assert_close(rotvec_to_rotmat(rotvec), rotmat, atol=tolerance, rtol=0)
-
-
-def test_rotmat_is_a_rotation_in_float32():
-    rotmat = rotvec_to_rotmat(random_rotvecs(1000, scale=3, dtype=torch.float32))
-    torch.testing.assert_close(rotmat @ rotmat.mT, torch.eye(3).expand(1000, 3, 3), atol=2e-6, rtol=0)
-    torch.testing.assert_close(torch.linalg.det(rotmat), torch.ones(1000), atol=2e-6, rtol=0)
 
 
 @pytest.mark.parametrize("angle", ANGLES)
@@ -137,14 +130,10 @@ def test_interpolation_goes_the_shortest_way_at_an_even_pace():
 
 
 def test_body_axes_reach_opengl_and_opencv_cameras():
-    forward, left, up = torch.eye(3, dtype=DTYPE)
-    torch.testing.assert_close(
-        BODY_TO_OPENGL @ torch.stack([left, up, forward], 1), torch.eye(3, dtype=DTYPE)
-    )
+    forward, left, up = axes = torch.eye(3, dtype=DTYPE)
+    torch.testing.assert_close(BODY_TO_OPENGL @ torch.stack([left, up, forward], 1), axes)
     right, down, away = -left, -up, -forward  # of a body that faces the camera, as its camera sees it
-    torch.testing.assert_close(
-        CAMERA_FROM_BODY @ torch.stack([-right, down, away], 1), torch.eye(3, dtype=DTYPE)
-    )
+    torch.testing.assert_close(CAMERA_FROM_BODY @ torch.stack([-right, down, away], 1), axes)
     opencv_from_opengl = torch.diag(torch.tensor([1, -1, -1], dtype=DTYPE))
     torch.testing.assert_close(CAMERA_FROM_BODY, opencv_from_opengl @ BODY_TO_OPENGL)
     assert torch.linalg.det(CAMERA_FROM_BODY).item() == pytest.approx(1)
@@ -184,9 +173,6 @@ def test_axes_that_are_no_order_of_the_three_are_named(axes):
     for function, shape in ((euler_to_rotmat, (3,)), (rotmat_to_euler, (3, 3))):
         with pytest.raises(ValueError, match=f"axes: expected 'x', 'y' and 'z' in some order, got '{axes}'"):
             function(axes, torch.zeros(shape))
-
-
-def test_an_unknown_axis_is_named():
     with pytest.raises(ValueError, match="axis: expected 'x', 'y' or 'z', got 'w'"):
         rotation_about("w", torch.zeros(()))
 
@@ -195,9 +181,7 @@ def test_an_unknown_axis_is_named():
 
 
 def test_two_columns_of_a_rotation_give_it_back():
-    rotmat = rotvec_to_rotmat(
-        torch.randn(20, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(4))
-    )
+    rotmat = rotvec_to_rotmat(random_rotvecs(20, scale=1))
     columns = rotmat[..., :2].mT.flatten(-2)
     torch.testing.assert_close(rot6d_to_rotmat(columns), rotmat)
     # Neither their lengths nor what the second has of the first matter.

@@ -2,13 +2,7 @@ import pytest
 import torch
 from torch import nn
 
-from ljn.nets.layers import (
-    StackedLinear,
-    StackedPReLU,
-    activate_and_pool,
-    perceptron,
-    stacked_perceptron,
-)
+from ljn.nets.layers import StackedLinear, StackedPReLU, activate_and_pool, perceptron, stacked_perceptron
 
 
 def test_stacked_layers_equal_a_loop_over_the_joints():

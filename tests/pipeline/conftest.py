@@ -20,13 +20,8 @@ NUM_POINTS = 128
 def stages():
     """A tiny joint detector and a tiny mesh regressor, untrained, as a pipeline takes them."""
     torch.manual_seed(0)
-    sizes = {
-        "local_channels": (8, 8),
-        "global_channels": (8, 16),
-        "group_channels": (8, 16),
-        "head_channels": (8,),
-    }
-    detector = JointDetector(LocalJointNetwork([0.25] * 24, group_size=16, **sizes))
+    sizes = {"local_channels": (8, 8), "global_channels": (8, 16), "group_channels": (8, 16)}
+    detector = JointDetector(LocalJointNetwork([0.25] * 24, group_size=16, head_channels=(8,), **sizes))
     trunk = PointNet(78, (8, 8), (8, 16))
     regressor = MeshRegressor(DirectBodyNetwork(trunk, head_channels=(8,), regressor_channels=(8,)))
     recipe = ObservationRecipe(NUM_POINTS, "window", spacing_m=1.5 / 366.458)

@@ -44,27 +44,10 @@ def test_what_is_no_depth_image_is_refused(image, tmp_path):
 
 
 def test_a_missing_file_is_named(tmp_path):
-    for name, read in (
-        ("depth", read_depth),
-        ("camera", read_camera),
-        ("keypoints", read_keypoints),
-        ("mask", read_mask),
-    ):
+    readers = {"depth": read_depth, "camera": read_camera, "keypoints": read_keypoints, "mask": read_mask}
+    for name, read in readers.items():
         with pytest.raises(FileNotFoundError, match=f"{name}: no file '.*nowhere.png'"):
             read(tmp_path / "nowhere.png")
-
-
-@pytest.mark.parametrize("suffix", [".png", ".npy", ".npz"])
-def test_a_damaged_depth_image_is_refused(suffix, image, tmp_path):
-    path = tmp_path / f"depth{suffix}"
-    {".png": lambda: Image.fromarray(image).save(path), ".npy": lambda: np.save(path, image)}.get(
-        suffix, lambda: np.savez(path, image)
-    )()
-    whole = path.read_bytes()
-    for content in (whole[: len(whole) // 2], b"", b"no image"):
-        path.write_bytes(content)
-        with pytest.raises(ValueError, match="is damaged, cut off or of another format"):
-            read_depth(path)
 
 
 def test_an_archive_of_something_else_than_an_array_is_refused(tmp_path):
@@ -117,11 +100,9 @@ def test_the_training_camera_is_read_from_the_configuration(kinect):
         ),
         ("fx: [1]\nfy: 1\ncx: 1\ncy: 1\nwidth: 9\nheight: 9", r"fx: expected a finite number.*got \[1\]"),
         ("fx: 1\nfy: wide\ncx: 1\ncy: 1\nwidth: 9\nheight: 9", "fy: expected a finite number.*got 'wide'"),
-        ("fx: 1\nfy: 1\ncx: null\ncy: 1\nwidth: 9\nheight: 9", "cx: expected a finite number.*got None"),
         ("fx: 1\nfy: 1\ncx: 1\ncy: true\nwidth: 9\nheight: 9", "cy: expected a finite number.*got True"),
         ("fx: 1\nfy: 1\ncx: 1\ncy: 1\nwidth: .inf\nheight: 9", "width: expected a finite number.*got inf"),
         ("fx: 1\nfy: 1\ncx: 1\ncy: 1\nwidth: 4.9\nheight: 9", r"width: expected a whole number.*got 4\.9"),
-        ("fx: 1\nfy: 1\ncx: 1\ncy: 1\nwidth: 9\nheight: 8.5", r"height: expected a whole number.*got 8\.5"),
         ("fx: 2001-99-99\nfy: 1", "is damaged"),
         ("fx: 1\nfy: 1\ncx: 1\ncy: 8\nwidth: 9\nheight: 5", "principal point.*lies outside.*swapped"),
         ("fx: {", "is damaged"),
@@ -132,13 +113,6 @@ def test_a_bad_camera_file_is_refused(text, message, tmp_path):
     (tmp_path / "camera.yaml").write_text(text)
     with pytest.raises(ValueError, match=message):
         read_camera(tmp_path / "camera.yaml")
-
-
-def test_keypoints_that_are_no_json_are_refused(tmp_path):
-    for text in ("[[1, 2], [", 100_000 * "["):
-        (tmp_path / "keypoints.json").write_text(text)
-        with pytest.raises(ValueError, match=r"keypoints\.json' is damaged"):
-            read_keypoints(tmp_path / "keypoints.json")
 
 
 def test_arrays_come_back(pipeline, given, kinect, tmp_path):

@@ -121,18 +121,15 @@ def test_a_lying_camera_of_another_size_sees_the_same_person(pipeline, samples):
 
 def test_pixels_much_denser_than_in_training_are_thinned_to_patches_of_the_same_size(kinect):
     step = 3
-    camera = Camera(
-        step * kinect.fx, step * kinect.fy, step * kinect.cx, step * kinect.cy, step * 424, step * 512
-    )
+    camera = Camera(**{name: step * value for name, value in vars(kinect).items()})
     # A tilted plane 1.4 m away, seen by both cameras: z = 1.4 + 0.3 x.
     images = []
     for one in (kinect, camera):
         v, u = np.mgrid[: one.height, : one.width]
         x = (u - one.cx) / one.fx
         depth = 1.4 / (1 - 0.3 * x)
-        images.append(
-            np.where((abs(x) < 0.13) & (abs(v - one.cy) < 0.13 * one.fy), depth, 0).astype(np.float32)
-        )
+        inside = (abs(x) < 0.13) & (abs(v - one.cy) < 0.13 * one.fy)
+        images.append(np.where(inside, depth, 0).astype(np.float32))
     recipe = ObservationRecipe(256, spacing_m=1.5 / kinect.fx)
     coarse, fine = (
         observe(image, one, None, recipe, ("points",), np.random.default_rng(0))["points"]
@@ -158,17 +155,11 @@ def test_pixels_much_denser_than_in_training_are_thinned_to_patches_of_the_same_
         (lambda d, k: (0.1 * d, k), "less than a person; is the depth in another unit"),
         (lambda d, k: (d, k + 300), r"keypoints: \d+ of 24 lie outside the image of 424 x 512"),
         (lambda d, k: (d, k / [424, 512]), "expected pixels, but all lie between 0 and 2.*multiply"),
-        (
-            lambda d, k: (d, k[:20]),
-            "keypoints: expected 24 .smpl24., 17 .coco17., 25 .body25. of them, got 20",
-        ),
+        (lambda d, k: (d, k[:20]), "keypoints: expected 24 .smpl24., 17 .coco17., 25 .body25. of them, got 20"),
         (lambda d, k: (d, k * [0.2, 0.2]), "lie near the body"),
-        (
-            lambda d, k: (d, np.where(np.arange(24)[:, None] < 7, k, np.nan)),
-            "7 joints are known, expected at least 8",
-        ),
+        (lambda d, k: (d, np.where(np.arange(24)[:, None] < 7, k, np.nan)), "7 joints are known, expected at least 8"),
     ],
-)
+)  # fmt: skip
 def test_bad_input_is_an_error_that_says_how_to_mend_it(change, message, pipeline, given, kinect):
     depth, keypoints = change(*given)
     with pytest.raises(ValueError, match=f"(?s){message}"):

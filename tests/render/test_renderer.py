@@ -1,8 +1,5 @@
 """Choosing a renderer, and what all of them have in common."""
 
-import subprocess
-import sys
-
 import pytest
 import torch
 
@@ -18,7 +15,7 @@ FACES = torch.tensor([[0, 1, 2]])
 
 def test_an_unknown_renderer_is_an_error_that_names_the_known_ones():
     with pytest.raises(
-        ValueError, match="renderer: expected one of auto, zbuffer, torch, pyrender, open3d, got 'opengl'"
+        ValueError, match="expected one of auto, zbuffer, torch, pyrender, open3d, got 'opengl'"
     ):
         get_renderer("opengl")
     assert RENDERERS == ("auto", "zbuffer", "torch", "pyrender", "open3d")
@@ -47,13 +44,3 @@ def test_a_renderer_of_depth_alone_names_those_that_offer_fragments():
         NotImplementedError, match=r"DepthAlone draws depth alone.*auto, zbuffer, torch and open3d"
     ):
         DepthAlone().fragments(TRIANGLE, FACES, CAMERA)
-
-
-def test_importing_the_package_loads_nothing_heavy():
-    code = (
-        "import sys; import ljn, ljn.render\n"
-        "loaded = {'numba', 'open3d', 'pyrender', 'wandb'} & set(sys.modules)\n"
-        "assert not loaded, loaded"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
-    assert done.returncode == 0, done.stderr

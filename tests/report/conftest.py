@@ -57,11 +57,8 @@ RECORD = {
     **JointMetrics.describe(),
     "truth": ["joints"],
     "is_root_relative": False,
-    "status": "complete",
-    "preset": "small",
-    "config_hash": "c0ffee12",
-    "commit": "0123456789abcdef",
-    "is_dirty": True,
+    **{"status": "complete", "preset": "small", "config_hash": "c0ffee12"},
+    **{"commit": "0123456789abcdef", "is_dirty": True},
     "versions": {"python": "3.11.7", "torch": "2.7.0"},
     "device": "cpu",
     "started": "2026-01-02T03:04:05+00:00",
@@ -98,14 +95,8 @@ def table_3_2(sweep):
         sweep.run("detector/basic", {"mpjpe_eq38": 90 + more, "pckh": 40 - more}, seed)
         sweep.run("detector/no_edm", {"mpjpe_eq38": 70 + more, "pckh": 52 - more}, seed)
         sweep.run("detector/proposed", {"mpjpe_eq38": 60 + more, "pckh": 55 - more}, seed)
-        aligned = {
-            "mpjpe_eq38": 999.0,
-            "mpjpe_root_aligned": 100 + more,
-            "pckh": 1.0,
-            "pckh_root_aligned": 30 - more,
-        }
-        sweep.run("detector/simple_baseline_0px", aligned, seed)
-    sweep.job(
-        "detector/simple_baseline", status="failed", error="ValueError: <script>alert(1)</script> & more_text"
-    )
+        aligned = {"mpjpe_root_aligned": 100 + more, "pckh_root_aligned": 30 - more}
+        sweep.run("detector/simple_baseline_0px", {"mpjpe_eq38": 999.0, "pckh": 1.0, **aligned}, seed)
+    error = "ValueError: <script>alert(1)</script> & more_text"
+    sweep.job("detector/simple_baseline", status="failed", error=error)
     return sweep.write("table_3_2")

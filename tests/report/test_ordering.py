@@ -18,10 +18,8 @@ def test_all_pairs_that_the_thesis_orders_and_that_have_results_are_compared(tab
     found = comparisons(table_3_2)
     assert verdict(found, 12) == (True, "holds in all 12 comparisons")
     assert judged(table_3_2) == (None, "holds in all 12 comparisons; 8 more want a result")
-    own = [
-        (entry.better, entry.worse) for entry in found if entry.column.label == "MPJPE" and entry.is_adjacent
-    ]
-    assert own == [
+    own = [entry for entry in found if entry.column.label == "MPJPE" and entry.is_adjacent]
+    assert [(entry.better, entry.worse) for entry in own] == [
         ("proposed", "proposed without EDM"),
         ("proposed without EDM", "basic"),
         ("basic", "simple baseline, σ = 0"),
@@ -108,43 +106,43 @@ def test_samples_that_another_machine_made_are_the_same(sweep):
     assert entry.interval == pytest.approx((5, 5))
 
 
+def spoil(path):
+    content = bytearray(path.read_bytes())
+    content[90:100] = b"\xff" * 10  # in the first array's data
+    path.write_bytes(content)
+
+
+def store(path, number=30, **arrays):
+    np.savez_compressed(
+        path, **{"sample_id": np.arange(number), "joints": np.zeros((number, 24, 3))} | arrays
+    )
+
+
 @pytest.mark.parametrize(
     "damage",
     [
-        "fewer samples",
-        "other samples",
+        lambda path: path.unlink(),
+        lambda path: path.write_bytes(b"PK\x03\x04 cut off"),
+        lambda path: (store(path, mpjpe_eq38=np.ones(30)), spoil(path)),
+        lambda path: store(path, 20, mpjpe_eq38=np.ones(20)),
+        lambda path: store(path, joints=np.full((30, 24, 3), 0.1), mpjpe_eq38=np.ones(30)),
+        lambda path: store(path, mpjpe_eq38=np.ones(7)),
+        lambda path: store(path, apve=np.ones(30)),
+    ],
+    ids=[
         "no file",
         "no zip file",
-        "a wrong byte",
-        "another metric",
+        "wrong bytes",
+        "fewer samples",
+        "other samples",
         "no row a sample",
+        "other metric",
     ],
 )
 def test_without_the_errors_of_the_same_samples_there_is_no_interval(sweep, damage):
     errors = np.random.default_rng(1).uniform(20, 90, 30)
     sweep.run("detector/basic", {"mpjpe_eq38": 60.0}, errors=errors)
-    folder = sweep.run(
-        "detector/proposed", {"mpjpe_eq38": 50.0}, errors=errors[:20] if "fewer" in damage else errors
-    )
-    path = folder / "test_errors.npz"
-    if damage == "no file":
-        path.unlink()
-    elif damage == "no zip file":
-        path.write_bytes(b"PK\x03\x04 cut off")
-    elif damage == "a wrong byte":
-        with np.load(path) as arrays:
-            np.savez_compressed(path, **dict(arrays))
-        content = bytearray(path.read_bytes())
-        content[90:100] = b"\xff" * 10  # in the first array's deflated data
-        path.write_bytes(content)
-    elif damage == "other samples":
-        with np.load(path) as arrays:
-            np.savez(path, **dict(arrays) | {"joints": arrays["joints"] + 0.1})
-    elif damage == "no row a sample":
-        with np.load(path) as arrays:
-            np.savez(path, **dict(arrays) | {"mpjpe_eq38": errors[:7]})
-    elif damage == "another metric":
-        np.savez(path, sample_id=np.arange(30), joints=np.zeros((30, 24, 3)), apve=errors)
+    damage(sweep.run("detector/proposed", {"mpjpe_eq38": 50.0}, errors=errors) / "test_errors.npz")
     (entry,) = comparisons(sweep.write("table_3_2"))
     assert entry.interval is None
 
@@ -154,12 +152,7 @@ def test_a_lead_of_what_should_be_high_has_its_interval_on_the_same_side(sweep):
     facts = {"headline": ["pckh"], "metrics": {"pckh": {"unit": "%", "goal": "max"}}}
     for name, more in (("a", 5), ("b", 0)):
         folder = sweep.run(name, {"pckh": shares.mean() + more}, errors=shares, **facts)
-        np.savez(
-            folder / "test_errors.npz",
-            sample_id=np.arange(30),
-            joints=np.zeros((30, 24, 3)),
-            pckh=shares + more,
-        )
+        store(folder / "test_errors.npz", pckh=shares + more)
     (entry,) = comparisons(sweep.write())
     assert (entry.better, entry.lead) == ("a", pytest.approx(5))
     assert entry.interval == pytest.approx((5, 5))

@@ -1,8 +1,6 @@
 import json
 import re
 import statistics
-import subprocess
-import sys
 
 import pytest
 
@@ -27,11 +25,8 @@ def test_mean_and_standard_deviation_are_over_seeds(sweep):
     assert cell.num_seeds == 3
     assert cell.difference == pytest.approx(65.0 - 24.2)
     assert row.status == "complete"
-
-
-def test_one_seed_has_no_standard_deviation(sweep):
-    sweep.run("detector/proposed", {"mpjpe_eq38": 60.0})
-    assert cells(sweep.write("table_3_2"))["proposed"].cells[0].sd is None
+    sweep.run("detector/basic", {"mpjpe_eq38": 60.0})
+    assert cells(sweep.write("table_3_2"))["basic"].cells[0].sd is None, "of one seed"
 
 
 def test_the_simple_baseline_is_shown_after_moving_the_roots(table_3_2):
@@ -84,11 +79,8 @@ def test_a_number_that_was_not_finite_is_no_result_to_be_proud_of(sweep):
 
 def test_an_experiment_that_ran_with_several_settings_has_a_row_for_each(sweep):
     for number in (512, 1024):
-        sweep.run(
-            "detector/basic",
-            {"mpjpe_eq38": number},
-            overrides=(f"data.num_test={number}", "num_threads=1"),
-        )
+        typed = (f"data.num_test={number}", "num_threads=1")
+        sweep.run("detector/basic", {"mpjpe_eq38": number}, overrides=typed)
     rows = cells(sweep.write("table_3_2"))
     assert rows["basic (data.num_test=512)"].cells[0].mean == 512
     assert rows["basic (data.num_test=1024)"].cells[0].mean == 1024
@@ -138,14 +130,10 @@ def test_a_grid_of_both_stages_has_a_table_for_each(sweep):
     tables = read_results(sweep.write()).tables
     assert [table.table.name for table in tables] == ["sweep_detector", "sweep_mesh"]
     assert [table.table.title for table in tables] == ["sweep: detector", "sweep: mesh"]
-    assert [[row.label for row in table.rows] for table in tables] == [
-        ["detector/basic"],
-        ["mesh/basic", "model.a=1"],
-    ]
-    assert [[column.metric for column in table.table.columns] for table in tables] == [
-        ["mpjpe", "pckh"],
-        ["apve", "mpjpe"],
-    ]
+    labels = [[row.label for row in table.rows] for table in tables]
+    assert labels == [["detector/basic"], ["mesh/basic", "model.a=1"]]
+    metrics = [[column.metric for column in table.table.columns] for table in tables]
+    assert metrics == [["mpjpe", "pckh"], ["apve", "mpjpe"]]
     assert all(cell.mean is not None for table in tables for row in table.rows for cell in row.cells)
 
 
@@ -154,10 +142,8 @@ def test_runs_without_a_record_are_with_other_seeds_of_theirs_or_else_in_the_fir
     sweep.run("mine", {"mpjpe": 40.0})
     for experiment in ("mesh/single", "mesh/basic", None):
         sweep.job(experiment, seed=1, status="failed")
-    rows = [
-        [(row.row.experiment, row.status) for row in table.rows]
-        for table in read_results(sweep.write()).tables
-    ]
+    tables = read_results(sweep.write()).tables
+    rows = [[(row.row.experiment, row.status) for row in table.rows] for table in tables]
     assert rows == [
         [("mine", "complete"), ("mesh/single", "failed"), (None, "failed")],
         [("mesh/basic", "failed 1 of 2")],
@@ -167,10 +153,8 @@ def test_runs_without_a_record_are_with_other_seeds_of_theirs_or_else_in_the_fir
 def test_metrics_of_runs_whose_records_say_nothing_of_them_are_all_shown(sweep):
     sweep.run("old", {"mpjpe": 40.0, "pckh": 50.0}, stage=None, headline=None, metrics=None)
     (table,) = read_results(sweep.write()).tables
-    assert [(column.heading, column.goal) for column in table.table.columns] == [
-        ("mpjpe", None),
-        ("pckh", None),
-    ]
+    columns = [(column.heading, column.goal) for column in table.table.columns]
+    assert columns == [("mpjpe", None), ("pckh", None)]
     assert [cell.mean for cell in table.rows[0].cells] == [40.0, 50.0]
 
 
@@ -248,10 +232,3 @@ def test_a_sweep_that_is_not_there_or_damaged_is_named(tmp_path):
 def test_an_unknown_table_is_refused_with_the_known_ones(sweep):
     with pytest.raises(ValueError, match=r"expected some of table_3_2, .*, got table_9"):
         read_results(sweep.write("table_9"))
-
-
-def test_reports_need_neither_torch_nor_hydra_to_be_imported():
-    code = (
-        "import sys, ljn.report; assert not {'torch', 'hydra', 'omegaconf', 'matplotlib'} & set(sys.modules)"
-    )
-    subprocess.run([sys.executable, "-c", code], check=True)

@@ -2,6 +2,11 @@ import pytest
 
 from ljn.report.tables import NUM_DATA, TABLES
 
+JOINTS, MESHES = ("mpjpe_eq38", "pckh"), ("apve", "mpjpe_eq38")
+NOISE_PX, NOISE_MM = (
+    ("initial_max_distance_" + unit, "initial_mean_distance_" + unit) for unit in ("px", "mm")
+)
+
 
 def printed(table, *metrics):
     return [[row.thesis.get(metric) for metric in metrics] for row in TABLES[table].rows]
@@ -10,34 +15,14 @@ def printed(table, *metrics):
 @pytest.mark.parametrize(
     ("table", "first", "second", "values"),
     [
-        (
-            "table_3_2",
-            "mpjpe_eq38",
-            "pckh",
-            [(32.1, 85.6), (25.0, 90.2), (24.2, 90.8), (59.4, 51.9), (81.3, 33.6)],
-        ),
-        ("table_3_3", "mpjpe_eq38", "pckh", [(14.3, 97.2), (18.6, 94.7), (24.2, 90.8), (31.4, 85.6)]),
-        (
-            "table_3_3",
-            "initial_max_distance_px",
-            "initial_mean_distance_px",
-            [(0, 0), (26.6, 6.3), (53.2, 12.5), (83.7, 19.0)],
-        ),
-        ("table_3_4", "mpjpe_eq38", "pckh", [(25.8, 90.1), (24.2, 90.8)]),
-        ("table_3_5", "apve", "mpjpe_eq38", [(43.1, 42.9), (42.2, 40.6), (35.6, 36.8), (34.5, 33.0)]),
-        (
-            "table_3_6",
-            "apve",
-            "mpjpe_eq38",
-            [(31.6, 30.5), (32.9, 31.5), (34.5, 33.0), (37.6, 36.0), (38.8, 36.8)],
-        ),
-        (
-            "table_3_6",
-            "initial_max_distance_mm",
-            "initial_mean_distance_mm",
-            [(0, 0), (52.9, 12.5), (105.6, 25.1), (170.0, 37.6), (None, None)],
-        ),
-        ("table_3_7", "apve", "mpjpe_eq38", [(36.0, 34.3), (34.5, 33.0)]),
+        ("table_3_2", *JOINTS, [(32.1, 85.6), (25.0, 90.2), (24.2, 90.8), (59.4, 51.9), (81.3, 33.6)]),
+        ("table_3_3", *JOINTS, [(14.3, 97.2), (18.6, 94.7), (24.2, 90.8), (31.4, 85.6)]),
+        ("table_3_3", *NOISE_PX, [(0, 0), (26.6, 6.3), (53.2, 12.5), (83.7, 19.0)]),
+        ("table_3_4", *JOINTS, [(25.8, 90.1), (24.2, 90.8)]),
+        ("table_3_5", *MESHES, [(43.1, 42.9), (42.2, 40.6), (35.6, 36.8), (34.5, 33.0)]),
+        ("table_3_6", *MESHES, [(31.6, 30.5), (32.9, 31.5), (34.5, 33.0), (37.6, 36.0), (38.8, 36.8)]),
+        ("table_3_6", *NOISE_MM, [(0, 0), (52.9, 12.5), (105.6, 25.1), (170.0, 37.6), (None, None)]),
+        ("table_3_7", *MESHES, [(36.0, 34.3), (34.5, 33.0)]),
     ],
 )
 def test_the_thesis_s_numbers_are_those_of_its_tables(table, first, second, values):

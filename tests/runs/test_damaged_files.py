@@ -39,14 +39,8 @@ JOB = {
 }
 SWEEP = {"name": "mine", "preset": "small", "tables": [], "command": "python run.py"}
 RECORD = {
-    "status": "complete",
-    "config_hash": "c0ffee",
-    "commit": "0123",
-    "is_dirty": True,
-    "wall_time_s": 3.5,
-    "attempts": 1,
-    "num_parameters": 10,
-    "stage": "detector",
+    **{"status": "complete", "config_hash": "c0ffee", "commit": "0123", "is_dirty": True, "wall_time_s": 3.5},
+    **{"attempts": 1, "num_parameters": 10, "stage": "detector"},
     "metrics": {"mpjpe": {"unit": "mm", "goal": "min"}},
     "headline": ["mpjpe"],
     "truth": ["joints"],
@@ -64,10 +58,8 @@ RECORD = {
 
 
 def write_sweep(directory):
-    contents = {
-        "sweep.json": SWEEP
-        | {"jobs": [JOB | {"run_dir": f"run-{number}", "seed": number} for number in (0, 1)]}
-    }
+    jobs = [JOB | {"run_dir": f"run-{number}", "seed": number} for number in (0, 1)]
+    contents = {"sweep.json": SWEEP | {"jobs": jobs}}
     for number in (0, 1):
         (directory / f"run-{number}").mkdir(exist_ok=True)
         contents[f"run-{number}/record.json"] = RECORD
@@ -79,10 +71,9 @@ def write_sweep(directory):
 
 def places(value, way=()):
     yield way
-    entries = (
-        value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
-    )
-    for key, entry in entries:
+    if isinstance(value, list):
+        value = dict(enumerate(value))
+    for key, entry in value.items() if isinstance(value, dict) else ():
         yield from places(entry, (*way, key))
 
 

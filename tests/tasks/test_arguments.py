@@ -46,13 +46,7 @@ def test_home_is_found(monkeypatch):
 
 def test_all_else_is_left_alone():
     for argument in (
-        *(
-            "ckpt_path='a b'",
-            "ckpt_path=",
-            "task.input=${paths.output_dir}/x",
-            "data.observation.num_points=512",
-            "-m",
-        ),
+        *("ckpt_path='a b'", "ckpt_path=", "task.input=${paths.output_dir}/x", "data.batch_size=5", "-m"),
         *("preset.name=a=b", "experiment=a,b", "ckpt_path", "~data.source"),
     ):
         assert prepare_arguments([argument]) == [argument]

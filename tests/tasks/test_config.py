@@ -9,7 +9,7 @@ from datamodules.synthesis import SynthesisSettings
 from ljn.building import build, build_each, check_targets
 from ljn.cloud.observation import ObservationRecipe
 from ljn.report.tables import TABLES
-from ljn.tasks.validation import check_writable, validate
+from ljn.tasks.validation import validate
 
 CONF = Path(__file__).parents[2] / "conf"
 GROUPS = sorted(
@@ -35,15 +35,10 @@ def test_every_config_composes_validates_and_builds(choice, compose_config, tmp_
         module, extra = NEEDS[choice]
         pytest.importorskip(module, reason=f"{module} is not installed: pip install -e '.[{extra}]'")
     overrides = [choice, f"paths.output_dir={tmp_path}"]
-    partners = {
-        "model=ridge": "module=yardstick",
-        "model=mean_offset": "module=yardstick",
-        "model=body_network": "module=mesh_regressor",
-        "model=body_network_on_pointnet": "module=mesh_regressor",
-        "model=direct_body_network": "module=mesh_regressor",
-        "module=yardstick": "model=ridge",
-        "module=mesh_regressor": "model=body_network",
-    }
+    partners = {"module=yardstick": "model=ridge", "module=mesh_regressor": "model=body_network"}
+    partners |= dict.fromkeys(("model=ridge", "model=mean_offset"), "module=yardstick")
+    of_bodies = ("model=body_network", "model=body_network_on_pointnet", "model=direct_body_network")
+    partners |= dict.fromkeys(of_bodies, "module=mesh_regressor")
     if choice in partners:
         overrides.append(partners[choice])
     cfg = compose_config(*overrides, return_hydra_config=True)
@@ -77,11 +72,7 @@ def test_every_experiment_opens_with_the_command_that_runs_it():
 
 @pytest.mark.parametrize("preset", sorted(path.stem for path in (CONF / "preset").glob("*.yaml")))
 def test_every_network_composes_with_every_preset(preset, compose_config, tmp_path):
-    for experiment in ("detector/proposed", "detector/basic", "detector/simple_baseline"):
-        validate(
-            compose_config(f"preset={preset}", f"experiment={experiment}", f"paths.output_dir={tmp_path}")
-        )
-    for experiment in ("mesh/proposed", "mesh/basic", "mesh/pointnet", "mesh/half_points"):
+    for experiment in ("detector/proposed", "detector/basic", "mesh/proposed", "mesh/basic", "mesh/pointnet"):
         cfg = compose_config(f"preset={preset}", f"experiment={experiment}", f"paths.output_dir={tmp_path}")
         validate(cfg)
         assert cfg.module.optimizer.lr == cfg.preset.learning_rate
@@ -109,48 +100,30 @@ def test_the_cosine_of_the_small_preset_ends_with_the_training(compose_config):
 
 def test_the_thesis_preset_holds_the_specs_numbers(compose_config):
     cfg = compose_config("preset=thesis", "experiment=detector/proposed")
-    assert (cfg.data.observation.num_points, cfg.data.num_train, cfg.data.num_val, cfg.data.num_test) == (
-        4096,
-        60000,
-        5000,
-        15000,
-    )
-    assert cfg.model.group_size == 128
+    assert (cfg.data.num_train, cfg.data.num_val, cfg.data.num_test) == (60000, 5000, 15000)
+    assert (cfg.data.observation.num_points, cfg.model.group_size) == (4096, 128)
     assert cfg.module.optimizer._target_ == "torch.optim.RAdam"
     assert (cfg.module.scheduler.step_size, cfg.module.scheduler.gamma) == (5, 0.1)
     assert cfg.data.observation.normals == "knn"
     mesh = compose_config("preset=thesis", "experiment=mesh/proposed").model
     assert (mesh.trunk.num_centres, mesh.trunk.group_sizes) == ([512, 128], [32, 64])
-    assert (mesh.trunk.channels, mesh.trunk.global_channels) == (
-        [[64, 64, 128], [128, 128, 256]],
-        [256, 512, 1024],
-    )
+    assert mesh.trunk.channels == [[64, 64, 128], [128, 128, 256]]
+    assert mesh.trunk.global_channels == [256, 512, 1024]
 
 
-def test_a_misspelt_key_is_rejected(compose_config):
-    with pytest.raises(ConfigCompositionException, match=r"num_pionts"):
-        compose_config("data.num_pionts=3")
-
-
-def test_a_value_of_the_wrong_type_is_rejected(compose_config):
-    with pytest.raises(ConfigCompositionException, match=r"seed"):
-        compose_config("seed=many")
+@pytest.mark.parametrize(("override", "name"), [("data.num_pionts=3", "num_pionts"), ("seed=many", "seed")])
+def test_a_misspelt_key_and_a_value_of_the_wrong_type_are_rejected(override, name, compose_config):
+    with pytest.raises(ConfigCompositionException, match=name):
+        compose_config(override)
 
 
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        (
-            ["model.radii_m=[0.2,0.3]"],
-            r"model\.radii_m: expected 24 radii, one for each joint \(pelvis.*got 2",
-        ),
+        (["model.radii_m=[0.2,0.3]"], r"model\.radii_m: expected 24 radii, one for each joint \(pelvis.*got 2"),
         (["model.radii_m=0.2"], r"model\.radii_m: expected 24 radii.*got 0\.2"),
-        (
-            ["data.observation.num_points=0"],
-            r"data\.observation\.num_points: expected an integer of 1 or more, got 0",
-        ),
+        (["data.observation.num_points=0"], r"data\.observation\.num_points: expected an integer of 1 or more, got 0"),
         (["data.batch_size=null"], r"data\.batch_size: expected an integer of 1 or more, got None"),
-        (["data.num_workers=-1"], r"data\.num_workers: expected an integer of 0 or more, got -1"),
         (["data.eval_seed=-1"], r"data\.eval_seed: expected an integer of 0 or more, got -1"),
         (
             ["experiment=mesh/proposed", "data.observation.num_points=100"],
@@ -159,41 +132,26 @@ def test_a_value_of_the_wrong_type_is_rejected(compose_config):
         ),
         (
             ["experiment=mesh/basic", "preset.mesh.num_centres=[16,32]"],
-            r"preset\.mesh\.num_centres\): expected no number greater than the one before, got \[16, 32\].*"
-            r"set preset\.mesh\.num_centres=\[32,16\]",
-        ),
-        (
-            ["experiment=mesh/proposed", "preset.mesh.num_centres=[16,0]"],
-            r"preset\.mesh\.num_centres\): expected an integer of 1 or more .*got \[16, 0\]",
+            r"expected no number greater than the one before, got \[16, 32\].*set preset\.mesh\.num_centres=\[32,16\]",
         ),
         (
             ["experiment=mesh/proposed", "preset.mesh.group_sizes=[0,4]"],
             r"preset\.mesh\.group_sizes\): expected an integer of 1 or more .*got \[0, 4\]",
         ),
-        (
-            ["experiment=mesh/proposed", "model.trunk.group_sizes=[2.5,4]"],
-            r"model\.trunk\.group_sizes .*: expected an integer of 1 or more .*got \[2\.5, 4\]",
-        ),
         *(
             ([f"preset.learning_rate={rate}"], r"module\.optimizer\.lr: expected a positive finite number")
-            for rate in ("0", "-1e-3", "nan", "inf", "null", "fast", "true")
+            for rate in ("0", "nan", "null", "true")
         ),
         (["num_threads=-2"], r"num_threads: expected 1 or more, or null, got -2"),
-        (["paths.cache_dir=/dev/null/x"], r"paths\.cache_dir: cannot write in '/dev/null/x'"),
         (["callbacks.best.monitor=val/mjpe"], r"callbacks\.best\.monitor: no metric 'val/mjpe'.*val/mpjpe"),
         (["optimized_metric=val/pckh"], r"callbacks\.best\.mode: 'min' would keep the worst.*mode=max"),
-        (
-            ["optimized_metric=val/initial_mean_distance_px"],
-            r"callbacks\.best\.monitor: .* describes the data",
-        ),
+        (["optimized_metric=val/initial_mean_distance_px"], r"callbacks\.best\.monitor: .* describes the data"),
         (["tables=[table_9]"], r"tables: expected some of table_3_2.*got table_9"),
         (["model._target_=os.system"], r"model: `_target_: os\.system` is outside the modules"),
-        (
-            ["paths.output_dir=/dev/null/x"],
-            r"paths\.output_dir: cannot write in '/dev/null/x'.*choose another",
-        ),
+        (["paths.cache_dir=/dev/null/x"], r"paths\.cache_dir: cannot write in '/dev/null/x'"),
+        (["paths.output_dir=/dev/null/x"], r"paths\.output_dir: cannot write in '/dev/null/x'.*choose another"),
     ],
-)
+)  # fmt: skip
 def test_what_types_cannot_say_is_validated(overrides, message, compose_config, tmp_path):
     cfg = compose_config(f"paths.output_dir={tmp_path}", *overrides)
     with pytest.raises(ValueError, match=message):
@@ -204,54 +162,30 @@ def test_what_types_cannot_say_is_validated(overrides, message, compose_config, 
     ("override", "message"),
     [
         ("data.synthesis.distance_m=2", "distance_m: expected two numbers, nearest and farthest, got 2"),
-        ("data.synthesis.distance_m=[1.5]", "distance_m: expected two numbers"),
         ("data.synthesis.distance_m=[3,1]", "distance_m: expected 0 < nearest <= farthest"),
         ("data.synthesis.depth_noise_m=nan", "depth_noise_m: expected a number of 0 or more, got nan"),
         ("data.synthesis.margin_px=300", "margin_px: a clear border of 300"),
+        ("data.synthesis.heading=sideways", "heading: expected one of source, histogram, uniform, got 'sideways'"),
     ],
-)
+)  # fmt: skip
 def test_bad_values_of_the_data_are_named_when_it_is_built(override, message, compose_config):
     with pytest.raises(ValueError, match=message):
         build(compose_config(override).data)
 
 
-def test_a_directory_below_a_file_cannot_be_written(tmp_path):
-    (tmp_path / "file").write_text("")
-    with pytest.raises(ValueError, match="cannot write"):
-        check_writable(tmp_path / "file" / "outputs")
-
-
 @pytest.mark.parametrize(
     "target",
     [
-        "os.system",
-        "builtins.eval",
-        "torch.load",
-        "subprocess.run",
-        "ljn.runs.record.subprocess.run",
-        "ljn.tasks.train.os.system",
-        "datamodules.cache.shutil.rmtree",
-        "lightning.pytorch.trainer.trainer.os.system",
-        "torch.optim.optimizer.torch.load",
-        "lightning.pytorch.cli.instantiate_class",
-        "lightning.pytorch.cli.LightningCLI",
-        "lightning.pytorch.profilers.SimpleProfiler",
-        "ljn.tasks.train.train",
-        "ljn.nets.layers.perceptron",
-        "ljn.nets.layers.no_such_thing",
+        "os.system", "builtins.eval", "torch.load", "ljn.runs.record.subprocess.run", "ljn.tasks.train.os.system",
+        "datamodules.cache.shutil.rmtree", "lightning.pytorch.trainer.trainer.os.system",
+        "torch.optim.optimizer.torch.load", "lightning.pytorch.cli.instantiate_class",
+        "lightning.pytorch.cli.LightningCLI", "lightning.pytorch.profilers.SimpleProfiler", "ljn.tasks.train.train",
+        "ljn.nets.layers.perceptron", "ljn.nets.layers.no_such_thing",
     ],
-)
+)  # fmt: skip
 def test_a_target_cannot_reach_code_outside_the_allow_list(target):
     with pytest.raises(ValueError, match="_target_"):
         check_targets({"module": {"net": [{"_target_": target}]}})
-
-
-def test_an_error_in_a_constructor_keeps_its_type_and_message(compose_config):
-    cfg = compose_config("data.synthesis.heading=sideways")
-    with pytest.raises(
-        ValueError, match="heading: expected one of source, histogram, uniform, got 'sideways'"
-    ):
-        build(cfg.data)
 
 
 def test_settings_objects_have_the_defaults_of_their_yaml(compose_config):
@@ -264,17 +198,8 @@ def test_no_config_reaches_an_object(compose_config, tmp_path):
     from omegaconf import DictConfig, ListConfig
 
     cfg = compose_config("experiment=detector/proposed", f"paths.run_dir={tmp_path}", "tags=[a,b]")
-    module = build(cfg.module)
-    datamodule = build(cfg.data)
-    parts = [*build_each(cfg.callbacks), *build_each(cfg.logger), datamodule.camera]
-    for owner in (
-        module,
-        module.net,
-        datamodule,
-        datamodule.synthesis,
-        datamodule.observation,
-        datamodule.source,
-        *parts,
-    ):
+    module, data = build(cfg.module), build(cfg.data)
+    parts = [data, data.camera, data.synthesis, data.observation, data.source]
+    for owner in (module, module.net, *parts, *build_each(cfg.callbacks), *build_each(cfg.logger)):
         for name, value in vars(owner).items():
             assert not isinstance(value, DictConfig | ListConfig), name

@@ -1,6 +1,5 @@
 import json
 
-import numpy as np
 import pytest
 import torch
 import yaml
@@ -15,46 +14,26 @@ def evaluation(smoke_config, trained, tmp_path, *overrides, ckpt_path=None):
     return smoke_config(tmp_path, "task=evaluate", f"ckpt_path={ckpt_path or checkpoint}", *overrides)
 
 
-def test_another_process_with_other_workers_gives_exactly_the_metrics_of_training(trained, run_py, tmp_path):
+def test_several_checkpoints_go_in_one_multirun_and_other_workers_give_exactly_the_metrics_of_training(
+    trained, run_py, tmp_path
+):
     metrics, run_dir = trained
-    run_py(
-        *(
-            "task=evaluate",
-            f"ckpt_path={run_dir / 'checkpoints' / 'best.ckpt'}",
-            f"paths.output_dir={tmp_path}",
-        ),
-        *("data.num_workers=2", "logger=csv"),
-    )
-    [evaluated] = (tmp_path / "evaluations").iterdir()
-    expected = {name: value for name, value in metrics.items() if name.startswith("test/")}
-    assert json.loads((evaluated / "metrics.json").read_text()) == expected
-    record = json.loads((evaluated / "record.json").read_text())
-    assert record["trained_by"] == run_dir.name
-    assert record["status"] == "complete"
-
-
-def test_several_checkpoints_go_in_one_multirun_with_other_noise(trained, run_py, tmp_path):
-    _, run_dir = trained
     other = edited(trained, tmp_path, lambda content: content["state_dict"]["net.head.4.bias"].add_(0.1))
-    checkpoints = [run_dir / "checkpoints" / "best.ckpt", other]
     done = run_py(
-        *(
-            "-m",
-            "task=evaluate",
-            f"ckpt_path={checkpoints[0]},{checkpoints[1]}",
-            f"paths.output_dir={tmp_path}",
-        ),
-        *("data.synthesis.keypoint_noise_px=15", "logger=csv"),
+        *("-m", "task=evaluate", f"ckpt_path={run_dir / 'checkpoints' / 'best.ckpt'},{other}"),
+        *(f"paths.output_dir={tmp_path}", "data.num_workers=2", "logger=csv"),
     )
     assert "2 jobs: 0 runs, 2 evaluations" in done.stdout
     [sweep] = (tmp_path / "sweeps").iterdir()
     evaluated = list((tmp_path / "evaluations").iterdir())
-    assert len(evaluated) == 2
     groups = {yaml.safe_load((directory / "config.yaml").read_text())["group"] for directory in evaluated}
     assert groups == {sweep.name.removesuffix("-smoke").removesuffix("-small")}
-    for directory in evaluated:
-        metrics = json.loads((directory / "metrics.json").read_text())
-        assert metrics["test/initial_mean_distance_px"] == pytest.approx(15 * np.sqrt(np.pi / 2), rel=0.1)
+    records = [json.loads((directory / "record.json").read_text()) for directory in evaluated]
+    assert {(record["trained_by"], record["status"]) for record in records} == {(run_dir.name, "complete")}
+    results = [json.loads((directory / "metrics.json").read_text()) for directory in evaluated]
+    expected = {name: value for name, value in metrics.items() if name.startswith("test/")}
+    assert [result == expected for result in results].count(True) == 1
+    assert len(results) == 2
 
 
 def test_an_evaluation_needs_a_checkpoint(smoke_config, tmp_path):
@@ -64,68 +43,11 @@ def test_an_evaluation_needs_a_checkpoint(smoke_config, tmp_path):
         evaluate(smoke_config(tmp_path, "task=evaluate", "ckpt_path=nowhere.ckpt"))
 
 
-def test_a_truncated_checkpoint_is_an_error(trained, smoke_config, tmp_path):
-    content = (trained[1] / "checkpoints" / "best.ckpt").read_bytes()
-    for share in (0.0, 0.5, 0.99):
-        (tmp_path / "cut.ckpt").write_bytes(content[: int(share * len(content))])
-        with pytest.raises(ValueError, match="damaged, truncated or no checkpoint at all"):
-            evaluate(evaluation(smoke_config, trained, tmp_path, ckpt_path=tmp_path / "cut.ckpt"))
-
-
-def test_a_foreign_checkpoint_is_an_error(trained, smoke_config, tmp_path):
-    torch.save({"state_dict": {}, "epoch": 3}, tmp_path / "foreign.ckpt")
-    with pytest.raises(ValueError, match="no checkpoint that a run of this library wrote"):
-        evaluate(evaluation(smoke_config, trained, tmp_path, ckpt_path=tmp_path / "foreign.ckpt"))
-
-
 def edited(trained, tmp_path, edit):
     content = torch.load(trained[1] / "checkpoints" / "best.ckpt", weights_only=True)
     edit(content)
     torch.save(content, tmp_path / "edited.ckpt")
     return tmp_path / "edited.ckpt"
-
-
-def test_weights_of_another_model_are_an_error(trained, smoke_config, tmp_path):
-    # The stored config is resolved: the module's copy of the network is what is built.
-    path = edited(
-        trained, tmp_path, lambda content: content["ljn"]["config"]["module"]["net"].update(edm=False)
-    )
-    with pytest.raises(ValueError, match=r"weights of another model.*'net\.first\.weight'"):
-        evaluate(evaluation(smoke_config, trained, tmp_path, ckpt_path=path))
-
-
-@pytest.mark.parametrize(
-    "edit",
-    [
-        lambda content: content.update(ljn={}),
-        lambda content: content["ljn"]["config"].pop("body"),
-        lambda content: content["ljn"]["config"].update(name="${oc.env:HOME}"),
-        lambda content: content["ljn"].update(version="1"),
-    ],
-)
-def test_an_incomplete_or_active_configuration_is_refused(edit, trained, smoke_config, tmp_path):
-    path = edited(trained, tmp_path, edit)
-    with pytest.raises(ValueError, match="carries no whole configuration"):
-        evaluate(evaluation(smoke_config, trained, tmp_path, ckpt_path=path))
-
-
-@pytest.mark.parametrize(("version", "age"), [(99, "a newer"), (0, "an older")])
-def test_a_checkpoint_of_another_version_is_an_error(version, age, trained, smoke_config, tmp_path):
-    path = edited(trained, tmp_path, lambda content: content["ljn"].update(version=version))
-    with pytest.raises(ValueError, match=f"written by {age} version"):
-        evaluate(evaluation(smoke_config, trained, tmp_path, ckpt_path=path))
-
-
-def test_code_named_by_a_checkpoint_is_refused(trained, smoke_config, tmp_path):
-    def edit(content):
-        content["ljn"]["config"]["module"]["net"] = {
-            "_target_": "os.system",
-            "command": f"touch {tmp_path / 'ran'}",
-        }
-
-    with pytest.raises(ValueError, match=r"checkpoint's config.*os\.system"):
-        evaluate(evaluation(smoke_config, trained, tmp_path, ckpt_path=edited(trained, tmp_path, edit)))
-    assert not (tmp_path / "ran").exists()
 
 
 def test_a_checkpoint_of_another_body_is_an_error(trained, smoke_config, tmp_path):
@@ -137,18 +59,13 @@ def test_a_checkpoint_of_another_body_is_an_error(trained, smoke_config, tmp_pat
 def test_overrides_change_data_and_nothing_that_the_checkpoint_decides(trained, smoke_config, tmp_path):
     checkpoint = read_checkpoint(trained[1] / "checkpoints" / "best.ckpt")
     cfg = evaluation(smoke_config, trained, tmp_path)
-    merged = with_checkpoint_config(
-        cfg, checkpoint, ["task=evaluate", "data.synthesis.keypoint_noise_px=15", "logger=csv"]
-    )
+    typed = ["task=evaluate", "data.synthesis.keypoint_noise_px=15", "logger=csv"]
+    merged = with_checkpoint_config(cfg, checkpoint, typed)
     assert merged.data.synthesis.keypoint_noise_px == 15
     assert merged.data.observation.num_points == 128
-    refused = ("model.edm=false", "preset=thesis", "experiment=detector/basic", "data=synthetic", "seed=3")
     for override in (
-        *refused,
-        "data/source=embedded",
-        "~data.synthesis.distance_m",
-        "+data.more=1",
-        "sweep=demo",
+        *("model.edm=false", "preset=thesis", "experiment=detector/basic", "data=synthetic", "seed=3"),
+        *("data/source=embedded", "~data.synthesis.distance_m", "+data.more=1", "sweep=demo"),
     ):
         with pytest.raises(ValueError, match="come from the checkpoint"):
             with_checkpoint_config(cfg, checkpoint, [override])
@@ -178,27 +95,3 @@ def test_other_bodies_reach_all_that_was_made_of_the_bodies_group(write_checkpoi
     assert (merged.data.body_path, merged.module.body_path) == ("bodies", "bodies")
     assert (merged.data.source.genders, merged.module.genders) == (["male"], ["male"])
     assert merged.module.predicted == "male"
-
-
-def test_bodies_can_be_given_as_other_files_with_the_same_content(trained, run_py, body_models, tmp_path):
-    (tmp_path / "bodies").mkdir()
-    for body in body_models:
-        np.savez(
-            tmp_path / "bodies" / f"SMPL_{body.gender.upper()}.npz",
-            v_template=body.v_template,
-            shapedirs=body.shapedirs,
-            posedirs=body.posedirs,
-            J_regressor=body.J_regressor,
-            weights=body.weights,
-            f=body.faces,
-            kintree_table=np.load(body.path)["kintree_table"],
-        )
-    done = run_py(
-        *(
-            "task=evaluate",
-            f"ckpt_path={trained[1] / 'checkpoints' / 'best.ckpt'}",
-            f"paths.output_dir={tmp_path}",
-        ),
-        *(f"body.path={tmp_path / 'bodies'}", "logger=csv"),
-    )
-    assert f"{trained[0]['test/mpjpe']:10.3f}" in done.stdout

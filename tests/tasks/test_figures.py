@@ -43,17 +43,14 @@ def test_noise_is_given_to_each_detector(config, checkpoints, write_checkpoint, 
     assert metrics["figures/joints_0"] != metrics["figures/joints_1"]
 
 
-def test_what_is_typed_changes_the_data_of_all_columns(config, checkpoints, tmp_path, monkeypatch):
+def test_meshes_are_drawn_of_the_data_that_are_typed(
+    config, checkpoints, write_checkpoint, tmp_path, monkeypatch
+):
     typed = ["task=figures", "data.synthesis.joint_noise_m=0.05"]
     monkeypatch.setattr("ljn.tasks.figures.typed_overrides", lambda: typed)
-    figures(config(regressors=[checkpoints[1]]))
-    assert read_page(tmp_path, "meshes")[0]["title"] == "mesh/proposed, 0.05 m"
-
-
-def test_meshes_are_drawn(config, checkpoints, write_checkpoint, tmp_path):
     metrics = figures(config(regressors=[checkpoints[1], write_checkpoint("mesh/basic")]))
     page = read_page(tmp_path, "meshes")
-    assert [column["title"] for column in page] == ["mesh/proposed, 0.02 m", "mesh/basic, 0.02 m"]
+    assert [column["title"] for column in page] == ["mesh/proposed, 0.05 m", "mesh/basic, 0.05 m"]
     assert metrics["figures/meshes_1"] == pytest.approx(np.mean(page[1]["errors_mm"]))
 
 
@@ -69,9 +66,6 @@ def test_wrong_calls_say_what_is_expected(config, checkpoints, write_checkpoint)
         figures(config("task.num_samples=1000", regressors=[regressor]))
     with pytest.raises(FileNotFoundError, match="no file 'missing"):
         figures(config(detectors=["missing.ckpt"]))
-
-
-def test_other_test_sets_are_refused(config, checkpoints, write_checkpoint):
     other = write_checkpoint("detector/proposed", "data.eval_seed=5")
     with pytest.raises(ValueError, match=r"test sets of .* differ"):
-        figures(config(detectors=[checkpoints[0], other]))
+        figures(config(detectors=[detector, other]))

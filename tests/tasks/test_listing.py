@@ -1,6 +1,3 @@
-import subprocess
-import sys
-
 from ljn.tasks.listing import CONF, GROUPS, descriptions, list_choices
 
 
@@ -30,16 +27,3 @@ def test_the_list_has_a_line_for_each(capsys):
     assert len(printed) == sum(1 + len(descriptions(CONF / group)) for group in GROUPS)
     [line] = [line for line in printed if line.startswith("  detector/basic ")]
     assert line.split(maxsplit=1)[1].startswith("The basic joint detector.")
-
-
-def test_the_command_loads_nothing_heavy():
-    code = (
-        "import sys; sys.argv = ['run.py', 'task=list']\nimport runpy\n"
-        "runpy.run_path('run.py', run_name='__main__')\n"
-        "heavy = {'torch', 'lightning', 'numba', 'wandb', 'open3d'} & set(sys.modules)\nassert not heavy, heavy"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", code], cwd=CONF.parent, capture_output=True, text=True, timeout=120
-    )
-    assert done.returncode == 0, done.stderr
-    assert "mesh/proposed" in done.stdout

@@ -2,9 +2,7 @@
 
 import csv
 import json
-import os
-import subprocess
-import sys
+import multiprocessing
 from collections import Counter
 from types import SimpleNamespace
 
@@ -17,6 +15,7 @@ from ljn.building import build
 from ljn.tasks import processes
 from ljn.tasks.processes import (
     check_trains_in_processes,
+    claim_gpu,
     is_first_process,
     num_processes,
     process_number,
@@ -44,9 +43,6 @@ def test_processes_share_a_fixed_set_without_repeating_a_sample(size, batch_size
     # A process that waits for the others in every batch waits for ever where they have fewer.
     assert len({len(part) for part in parts}) == 1
     assert all(batch for part in parts for batch in part)
-
-
-def test_one_process_has_full_batches_of_a_fixed_set():
     assert [len(batch) for batch in fixed_batches(20, 8)] == [8, 8, 4]
 
 
@@ -139,40 +135,40 @@ def test_one_of_several_processes_is_refused_for_one_device(smoke_config, tmp_pa
         validate(smoke_config(tmp_path))
 
 
-def test_a_sweep_on_several_devices_is_refused_before_it_starts_itself_again(run_py, tmp_path):
-    done = run_py("-m", *RUN, *TWO, "seed=0,1", f"paths.output_dir={tmp_path}", check=False)
-    assert done.returncode != 0
-    assert "a job of a sweep uses one device, got 2" in done.stderr
-    assert "hydra/launcher=parallel" in done.stderr
-    assert not list(tmp_path.glob("runs/*"))
+def test_a_sweep_on_several_devices_is_refused(smoke_config, tmp_path, monkeypatch):
+    monkeypatch.setattr(processes, "is_job_of_sweep", lambda: True)
+    with pytest.raises(ValueError, match=r"a job of a sweep uses one device, got 2.*hydra/launcher=parallel"):
+        validate(smoke_config(tmp_path, *TWO))
 
 
-def test_jobs_side_by_side_claim_a_gpu_each(tmp_path):
-    code = (
-        "import sys; from pathlib import Path; from ljn.tasks.processes import claim_gpu\n"
-        "first = claim_gpu(2, Path(sys.argv[1])); assert claim_gpu(2, Path(sys.argv[1])) == first\n"
-        "print(first, flush=True); input()"
-    )
+def test_jobs_side_by_side_claim_a_gpu_each(tmp_path, monkeypatch):
+    monkeypatch.delenv("CUDA_VISIBLE_DEVICES", raising=False)
+    context = multiprocessing.get_context("fork")
+    answers = context.Queue()
+
+    def claim(is_over):
+        first = claim_gpu(2, tmp_path)
+        assert claim_gpu(2, tmp_path) == first
+        answers.put(first)
+        is_over.wait(30)
 
     def start():
-        return subprocess.Popen(
-            [sys.executable, "-c", code, str(tmp_path)],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-            env={name: value for name, value in os.environ.items() if name != "CUDA_VISIBLE_DEVICES"},
-        )
+        is_over = context.Event()
+        job = context.Process(target=claim, args=(is_over,))
+        job.start()
+        return job, is_over, answers.get(timeout=30)
 
-    with start() as first, start() as second:
-        assert {first.stdout.readline(), second.stdout.readline()} == {"0\n", "1\n"}
-        with start() as third:  # more jobs than GPUs share
-            assert third.stdout.readline() in ("0\n", "1\n")
-            third.communicate("\n")
-        first.communicate("\n")
-        second.communicate("\n")
-    with start() as later:  # a claim ends with its process
-        assert later.stdout.readline() == "0\n"
-        later.communicate("\n")
+    jobs = [start() for _ in range(3)]  # the third of more jobs than GPUs shares
+    assert {number for *_, number in jobs[:2]} == {0, 1}
+    assert jobs[2][2] in (0, 1)
+    for job, is_over, _ in jobs:
+        is_over.set()
+        job.join(30)
+        assert job.exitcode == 0
+    job, is_over, number = start()  # a claim ends with its process
+    is_over.set()
+    job.join(30)
+    assert number == 0
 
 
 def test_only_a_job_of_a_sweep_on_several_gpus_claims_one(monkeypatch):
@@ -228,7 +224,7 @@ def test_two_processes_train_what_one_trains(on_one, on_two):
 
 @pytest.mark.slow
 @pytest.mark.ddp
-def test_two_processes_write_one_runs_files_and_lines(on_one, on_two):
+def test_two_processes_write_one_runs_files_and_lines_and_test_every_sample_once(on_one, on_two):
     (_, one), (done, two) = on_one, on_two
     record = json.loads((two / "record.json").read_text())
     assert (record["status"], record["attempts"], record["num_devices"]) == ("complete", 1, 2)
@@ -237,12 +233,6 @@ def test_two_processes_write_one_runs_files_and_lines(on_one, on_two):
     for line in ("training in", "epoch 1/2", "epoch 2/2", "test/mpjpe "):
         assert done.stdout.count(line) == 1, done.stdout
     assert "Traceback" not in done.stderr
-
-
-@pytest.mark.slow
-@pytest.mark.ddp
-def test_two_processes_test_every_sample_once(on_one, on_two):
-    (_, one), (_, two) = on_one, on_two
     with np.load(one / "test_errors.npz") as ours, np.load(two / "test_errors.npz") as theirs:
         assert theirs["sample_id"].tolist() == list(range(13))
         assert set(ours) == set(theirs)
@@ -251,24 +241,15 @@ def test_two_processes_test_every_sample_once(on_one, on_two):
 
 @pytest.mark.slow
 @pytest.mark.ddp
-def test_two_processes_measure_what_one_measures(on_one, run_py, tmp_path):
+def test_two_processes_measure_what_one_measures_and_find_its_run_again(on_one, run_py, tmp_path):
     metrics, run_dir = on_one
     checkpoint = run_dir / "checkpoints" / "best.ckpt"
-    run_py(
-        *("task=evaluate", f"ckpt_path={checkpoint}", "logger=csv", f"paths.output_dir={tmp_path}"),
-        *("trainer.devices=2", "trainer.accelerator=cpu", "trainer.strategy=ddp"),
-    )
+    run_py(*("task=evaluate", f"ckpt_path={checkpoint}", "logger=csv", f"paths.output_dir={tmp_path}", *TWO))
     [path] = tmp_path.glob("evaluations/*/metrics.json")
     expected = {name: value for name, value in metrics.items() if name.startswith("test/")}
     assert json.loads(path.read_text()) == pytest.approx(expected, rel=1e-6)
     with np.load(path.parent / "test_errors.npz") as errors:
         assert errors["sample_id"].tolist() == list(range(13))
-
-
-@pytest.mark.slow
-@pytest.mark.ddp
-def test_a_finished_run_is_found_again_by_two_processes(on_one, run_py):
-    _, run_dir = on_one
     before = (run_dir / "record.json").read_text()
     done = run_py(*RUN, *TWO, f"paths.output_dir={run_dir.parents[1]}")
     assert "is complete" in done.stdout

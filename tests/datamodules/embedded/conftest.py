@@ -2,16 +2,10 @@ import numpy as np
 import pytest
 import torch
 
-from datamodules.sources.embedded.posture import Draw
 from datamodules.sources.embedded.procedural import draw_poses
 from ljn.body.kinematics import joint_positions, world_rotations
 from ljn.body.skeleton import JOINT_INDEX, NUM_JOINTS
 from ljn.geometry.rotations import euler_to_rotmat
-
-
-@pytest.fixture
-def draw():
-    return Draw(np.random.default_rng(0), 500)
 
 
 @pytest.fixture(scope="session")

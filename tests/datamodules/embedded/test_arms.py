@@ -51,14 +51,8 @@ def test_the_wrist_reaches_its_target_and_the_elbow_lies_towards_the_pole(offset
 def test_what_is_out_of_reach_is_reached_for(offsets):
     to_elbow, to_wrist = bones(offsets, "l")
     target = torch.tensor([[0.0, 2.0, 0.0]], dtype=DTYPE)
-    shoulder, elbow = reach(
-        to_elbow,
-        to_wrist,
-        target,
-        torch.tensor([[1.0, 0, 0]]).double(),
-        torch.zeros(1).double(),
-        torch.ones(1).double(),
-    )
+    pole, turn, side = torch.tensor([[1.0, 0, 0]]).double(), torch.zeros(1).double(), torch.ones(1).double()
+    shoulder, elbow = reach(to_elbow, to_wrist, target, pole, turn, side)
     wrist = (shoulder @ (to_elbow[:, None] + elbow @ to_wrist[:, None])).squeeze(-1)
     assert torch.cosine_similarity(wrist, target).item() == pytest.approx(1)
     assert 0.98 < wrist.norm() / (to_elbow.norm() + to_wrist.norm()) <= 1

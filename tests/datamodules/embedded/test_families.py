@@ -13,7 +13,6 @@ from ljn.body.skeleton import JOINT_INDEX
 from ljn.geometry.rotations import rotmat_to_rotvec
 
 FEET = [JOINT_INDEX[f"{side}_{name}"] for side in SIDES for name in ("foot", "ankle")]
-FLOOR = {"crawl", "lie"}
 
 
 @pytest.fixture(params=FAMILIES)
@@ -118,25 +117,12 @@ def test_squatters_bend_both_knees_and_keep_their_feet_under_them(family_poses, 
     assert (ankles[:, 2] - middle[:, 2]).abs().mean() < 0.25
 
 
-def test_lungers_feet_are_far_apart(family_poses, place):
-    joints = place(family_poses("lunge"))
-    apart = (joints["l_ankle"] - joints["r_ankle"]).norm(dim=-1)
-    assert apart.median() > 0.6
-
-
 def test_sitters_have_level_thighs_and_an_upright_trunk(family_poses, place):
     joints = place(family_poses("sit"))
     for side in SIDES:
         thigh = joints[f"{side}_knee"] - joints[f"{side}_hip"]
         assert (thigh[:, 1] / thigh.norm(dim=-1)).asin().rad2deg().abs().median() < 25
     assert trunk_elevation(joints).median() > 60
-
-
-def test_kickers_stand_on_one_leg(family_poses, place):
-    joints = place(family_poses("kick"))
-    ankles = torch.stack([joints["l_ankle"][:, 1], joints["r_ankle"][:, 1]], 1)
-    assert (ankles[:, 0] - ankles[:, 1]).abs().median() > 0.2
-    assert trunk_elevation(joints).median() > 55
 
 
 def test_kneelers_have_a_knee_lowest_or_nearly(family_poses, place):
@@ -172,20 +158,7 @@ def test_hands_stay_in_reach_of_the_shoulders(family, family_poses, place, offse
         assert distance.max() < 1.0
 
 
-def test_draws_have_their_shapes_and_bounds(draw):
-    assert draw.normal(2.0).shape == (500,)
-    assert draw.normal(2.0, 2).std() == pytest.approx(2, rel=0.1)
-    assert draw.half_normal(1.0, 2).min() >= 0
-    values = draw.uniform(3, 5)
-    assert values.min() >= 3
-    assert values.max() < 5
-    assert draw.chance(0.2).mean() == pytest.approx(0.2, abs=0.06)
-    sides = draw.sides(np.ones(500), np.zeros(500))
-    assert (sides.sum(1) == 1).all()
-    assert sides[:, 0].mean() == pytest.approx(0.5, abs=0.08)
-
-
-def test_goals_come_in_their_shares_and_often_alike(draw):
+def test_goals_come_in_their_shares_and_often_alike():
     names = list(GOALS)
     goals = Draw(np.random.default_rng(0), 5000).goals({"hang": 3, "wide": 1})
     assert set(np.unique(goals)) == {names.index("hang"), names.index("wide")}
