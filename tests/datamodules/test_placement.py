@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 
-from datamodules.placement import HEADINGS, draw_heading, floor_height, place
+from datamodules.placement import HEADINGS, draw_heading, place
 from ljn.body import SMPL
 from ljn.geometry.camera import project
 from ljn.geometry.rotations import CAMERA_FROM_BODY, smpl_pose_to_body_world
@@ -108,13 +108,6 @@ def test_margins_that_leave_nothing_of_the_image_are_an_error(small_object, kine
     narrow = dataclasses.replace(kinect, cx=5.0, width=12)
     with pytest.raises(ValueError, match="margin_px"):
         place(small_object, narrow, np.zeros(3))
-
-
-def test_the_floor_touches_each_mesh_from_below():
-    vertices = np.random.default_rng(0).standard_normal((3, 50, 3))
-    heights = floor_height(vertices)
-    np.testing.assert_array_equal(heights, [min(mesh[:, 2]) for mesh in vertices])
-    assert floor_height(vertices[0] + [0, 0, 1.5]) == pytest.approx(heights[0] + 1.5)
 
 
 # Headings

@@ -37,7 +37,10 @@ def test_every_config_composes_validates_and_builds(choice, compose_config, tmp_
     overrides = [choice, f"paths.output_dir={tmp_path}"]
     partners = {"module=yardstick": "model=ridge", "module=mesh_regressor": "model=body_network"}
     partners |= dict.fromkeys(("model=ridge", "model=mean_offset"), "module=yardstick")
-    of_bodies = ("model=body_network", "model=body_network_on_pointnet", "model=direct_body_network")
+    of_bodies = [
+        f"model={name}"
+        for name in ("body_network", "body_network_on_pointnet", "direct_body_network", "kinematic")
+    ]
     partners |= dict.fromkeys(of_bodies, "module=mesh_regressor")
     if choice in partners:
         overrides.append(partners[choice])
