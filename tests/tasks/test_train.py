@@ -1,6 +1,5 @@
 import csv
 import json
-import multiprocessing
 import os
 import shutil
 import signal
@@ -309,45 +308,29 @@ def test_sigterm_and_ctrl_c_are_said_and_recorded_and_the_run_goes_on(tmp_path):
     assert f"epoch {epoch}/400" not in output
 
 
-def train_in_a_group(cfg):
-    os.setsid()  # a signal ends it with its workers
-    torch.set_num_threads(1)
-    train(cfg)
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(("experiment", "num_workers"), [("detector/proposed", 1), ("mesh/proposed", 2)])
-def test_a_run_killed_at_five_random_moments_equals_an_uninterrupted_one(
-    tmp_path, smoke_config, experiment, num_workers
-):
-    overrides = (f"experiment={experiment}", "trainer.max_epochs=12", f"data.num_workers={num_workers}")
-
-    def begin(directory):
-        # A fork: what is killed is a process of its own, without the seconds that its imports take.
-        cfg = smoke_config(directory, *overrides)
-        process = multiprocessing.get_context("fork").Process(target=train_in_a_group, args=(cfg,))
-        process.start()
-        return process
-
+def test_a_run_killed_at_five_random_moments_equals_an_uninterrupted_one(tmp_path, experiment, num_workers):
+    overrides = (f"experiment={experiment}", "trainer.max_epochs=20", f"data.num_workers={num_workers}")
     results = {}
     for name, num_kills in (("killed", 5), ("whole", 0)):
         directory = tmp_path / name
         moments = np.random.default_rng(num_workers).uniform(0, 2.5, num_kills)
         for attempt, moment in enumerate(moments, 1):
-            process = begin(directory)
+            process = start(directory, *overrides)
 
             def has_begun(directory=directory, attempt=attempt):
                 records = [read_json(path) for path in directory.glob("runs/*/record.json")]
                 return any(record and record["attempts"] == attempt for record in records)
 
-            wait_for(has_begun, lambda process=process: process.exitcode)
+            wait_for(has_begun, process.poll)
             time.sleep(moment)
-            assert process.exitcode is None, "it ended before it was killed; train for more epochs"
+            assert process.poll() is None, "it ended before it was killed; train for more epochs"
             os.killpg(process.pid, signal.SIGKILL)
-            process.join(60)
-        process = begin(directory)
-        process.join(300)
-        assert process.exitcode == 0
+            process.communicate(timeout=60)
+        process = start(directory, *overrides)
+        output = process.communicate(timeout=300)[0]
+        assert process.returncode == 0, output
         [run_dir] = directory.glob("runs/*")
         assert read_json(run_dir / "record.json")["attempts"] == num_kills + 1
         with np.load(run_dir / "test_errors.npz") as errors:
