@@ -15,6 +15,8 @@ from ljn.nets.layers import StackedLinear, StackedPReLU, perceptron, stacked_per
 from ljn.nets.pointnet import PointNet
 from ljn.nets.pointnet2 import PointNet2
 
+_MAX_ITERATIONS = 100  # a checkpoint from anywhere may ask for any number
+
 ROTATIONS = {"rotvec": (3, rotvec_to_rotmat), "rot6d": (6, rot6d_to_rotmat)}
 """Forms in which a network holds a joint's rotation: how many numbers, and the way to a matrix."""
 
@@ -70,8 +72,8 @@ class CloudBodyNetwork(BodyNetwork):
         super().__init__()
         if rotation not in ROTATIONS:
             raise ValueError(f"rotation: expected one of {', '.join(ROTATIONS)}, got '{rotation}'")
-        if num_iterations < 1:
-            raise ValueError(f"num_iterations: expected at least 1, got {num_iterations}")
+        if not 1 <= num_iterations <= _MAX_ITERATIONS:
+            raise ValueError(f"num_iterations: expected 1 to {_MAX_ITERATIONS}, got {num_iterations}")
         self.num_iterations = num_iterations
         self.num_angles, self._to_rotmat = ROTATIONS[rotation]
         self.trunk = trunk

@@ -154,5 +154,5 @@ def test_iterations_share_their_weights(make):
 def test_bad_arguments_are_refused(make):
     with pytest.raises(ValueError, match="rotation: expected one of rotvec, rot6d, got 'quaternion'"):
         make(rotation="quaternion")
-    with pytest.raises(ValueError, match="num_iterations: expected at least 1, got 0"):
+    with pytest.raises(ValueError, match="num_iterations: expected 1 to 100, got 0"):
         make(num_iterations=0)
