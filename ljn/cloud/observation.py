@@ -61,6 +61,8 @@ class ObservationRecipe:
         for name in ("num_points", "crop_px"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name}: expected at least 1, got {getattr(self, name)}")
+        if self.crop_px % 2:
+            raise ValueError(f"crop_px: expected an even number, which can be halved, got {self.crop_px}")
         if self.normals not in NORMALS:
             raise ValueError(f"normals: expected one of {', '.join(NORMALS)}, got '{self.normals}'")
         if self.spacing_m is not None and not 0 < self.spacing_m < np.inf:

@@ -1,5 +1,6 @@
 """Stage 2 as a LightningModule: training, validation and test of a mesh regressor."""
 
+import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, cast
@@ -59,6 +60,8 @@ class MeshRegressor(StageModule):
     ) -> None:
         super().__init__(net, optimizer, scheduler)
         self.kind_of_loss = check_loss(loss)
+        if not 0 <= joint_weight < math.inf:
+            raise ValueError(f"joint_weight: expected a number of 0 or more, got {joint_weight}")
         self.joint_weight = joint_weight
         self.body = SMPL(load_body_models(body_path, [predicted]))
         self.target_body = SMPL(load_body_models(body_path, list(genders)))

@@ -214,6 +214,10 @@ class Pipeline:
     @torch.inference_mode()
     def predict(self, frames: Sequence[ObservedFrame]) -> Prediction:
         """Run the networks on a batch of at least one frame, all with keypoints or all without."""
+        if len({frame.confidences is None for frame in frames}) > 1:
+            raise ValueError(
+                "keypoints: some images of the batch have them and some have not; predict them in two batches"
+            )
         detector = self.detector.module
         seen = stack_observations([frame.detector for frame in frames])
         joints = detector(_on(detector.device, seen))

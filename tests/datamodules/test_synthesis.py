@@ -301,6 +301,7 @@ def test_poses_without_a_heading_of_their_own_cannot_keep_it(make):
     [
         (ObservationRecipe, {"num_points": 0}, "num_points: expected at least 1, got 0"),
         (ObservationRecipe, {"crop_px": 0}, "crop_px: expected at least 1, got 0"),
+        (ObservationRecipe, {"crop_px": 127}, "crop_px: expected an even number"),
         (ObservationRecipe, {"spacing_m": -1.0}, "spacing_m: expected a positive number"),
         (ObservationRecipe, {"normals": "pca"}, "normals: expected one of window, knn, open3d, got 'pca'"),
         (SynthesisSettings, {"heading": "front"}, "heading: expected one of source, histogram, uniform, got 'front'"),

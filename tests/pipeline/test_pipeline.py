@@ -9,6 +9,8 @@ from ljn.body.skeleton import ROOT
 from ljn.cloud.observation import ObservationRecipe, observe
 from ljn.geometry.camera import Camera, project
 from ljn.geometry.rotations import CAMERA_FROM_BODY
+from ljn.modules.joint_detector import JointDetector
+from ljn.nets.cascade import PatchCascade
 from ljn.pipeline.pipeline import Pipeline
 from ljn.render import get_renderer
 
@@ -180,3 +182,14 @@ def test_an_error_in_a_batch_names_the_image(pipeline, given, kinect):
         pipeline(np.stack([depth, 0 * depth]), kinect, [keypoints, keypoints])
     with pytest.raises(ValueError, match=re.escape("got 2 images, 1 keypoints and 2 masks")):
         pipeline(np.stack([depth, depth]), kinect, [keypoints])
+
+
+def test_keypoints_of_some_images_alone_are_an_error(stages, given, kinect):
+    torch.manual_seed(0)
+    detector = JointDetector(PatchCascade("crop", patch_sizes_m=(0.5,))).eval().requires_grad_(False)
+    pipeline = Pipeline(stages[0]._replace(module=detector))
+    depth, keypoints = np.stack([given[0]] * 2), given[1]
+    assert pipeline(depth, kinect).joints.shape == (2, 24, 3)
+    assert pipeline(depth, kinect).keypoints is None
+    with pytest.raises(ValueError, match="keypoints: some images of the batch have them"):
+        pipeline(depth, kinect, [None, keypoints])
