@@ -7,7 +7,7 @@ from torch import Tensor
 
 from ljn.body.skeleton import NUM_JOINTS
 from ljn.nets.detector import CloudDetector
-from ljn.nets.layers import perceptron
+from ljn.nets.layers import OUTPUT_SCALE, perceptron
 from ljn.nets.pointnet import PointNet
 
 
@@ -32,7 +32,11 @@ class BasicDetector(CloudDetector):
     ) -> None:
         super().__init__(output)
         self.trunk = PointNet(in_channels + 3 * NUM_JOINTS, local_channels, global_channels)
-        self.head = perceptron([global_channels[-1], *head_channels, 3 * NUM_JOINTS], last_activation=False)
+        self.head = perceptron(
+            [global_channels[-1], *head_channels, 3 * NUM_JOINTS],
+            last_activation=False,
+            last_scale=OUTPUT_SCALE,
+        )
 
     def regress(self, points: Tensor, initial_joints: Tensor) -> Tensor:
         """See `CloudDetector.regress`."""

@@ -11,7 +11,7 @@ from ljn.body import SMPL
 from ljn.body.files import NUM_BETAS
 from ljn.body.skeleton import LEVELS, NUM_JOINTS, PARENTS, ROOT
 from ljn.geometry.rotations import BODY_TO_OPENGL, rot6d_to_rotmat, rotvec_to_rotmat
-from ljn.nets.layers import StackedLinear, StackedPReLU, perceptron, stacked_perceptron
+from ljn.nets.layers import OUTPUT_SCALE, StackedLinear, StackedPReLU, perceptron, stacked_perceptron
 from ljn.nets.pointnet import PointNet
 from ljn.nets.pointnet2 import PointNet2
 
@@ -78,7 +78,11 @@ class CloudBodyNetwork(BodyNetwork):
         self.num_angles, self._to_rotmat = ROTATIONS[rotation]
         self.trunk = trunk
         num_outputs = NUM_JOINTS * self.num_angles + NUM_BETAS
-        self.head = perceptron([self.trunk.out_channels, *head_channels, num_outputs], last_activation=False)
+        self.head = perceptron(
+            [self.trunk.out_channels, *head_channels, num_outputs],
+            last_activation=False,
+            last_scale=OUTPUT_SCALE,
+        )
         identity = [0.0, 0, 0] if rotation == "rotvec" else [1.0, 0, 0, 0, 1, 0]
         self.mean_pose = nn.Parameter(torch.tensor(identity).repeat(NUM_JOINTS, 1))
         self.mean_betas = nn.Parameter(torch.zeros(NUM_BETAS))
@@ -151,6 +155,7 @@ class HierarchicalBodyNetwork(CloudBodyNetwork):
         self.beta_regressor = perceptron(
             [size + NUM_JOINTS * self.num_angles + NUM_BETAS, *regressor_channels, NUM_BETAS],
             last_activation=False,
+            last_scale=OUTPUT_SCALE,
         )
 
     def refine(self, feature: Tensor, pose: Tensor, betas: Tensor) -> list[tuple[Tensor, Tensor]]:
@@ -196,7 +201,9 @@ class JointRegressors(nn.Module):
         self.num_inputs = num_inputs
         self.first = StackedLinear(self.num_joints, num_inputs + feature_channels, channels[0])
         self.first_activation = StackedPReLU(self.num_joints)
-        self.rest = stacked_perceptron(self.num_joints, [*channels, num_angles], last_activation=False)
+        self.rest = stacked_perceptron(
+            self.num_joints, [*channels, num_angles], last_activation=False, last_scale=OUTPUT_SCALE
+        )
 
     def share(self, feature: Tensor) -> Tensor:
         """The first layer's part that all iterations share: `(B, C)` -> `(k, B, channels[0])`."""
@@ -242,7 +249,9 @@ class DirectBodyNetwork(CloudBodyNetwork):
         super().__init__(trunk, num_iterations, rotation, head_channels)
         num_values = NUM_JOINTS * self.num_angles + NUM_BETAS
         self.regressor = perceptron(
-            [self.trunk.out_channels + num_values, *regressor_channels, num_values], last_activation=False
+            [self.trunk.out_channels + num_values, *regressor_channels, num_values],
+            last_activation=False,
+            last_scale=OUTPUT_SCALE,
         )
 
     def refine(self, feature: Tensor, pose: Tensor, betas: Tensor) -> list[tuple[Tensor, Tensor]]:

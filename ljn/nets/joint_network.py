@@ -8,7 +8,7 @@ from torch import Tensor
 from ljn.body.skeleton import NUM_JOINTS
 from ljn.geometry.points import ball_group, distance_matrix, gather_points
 from ljn.nets.detector import CloudDetector
-from ljn.nets.layers import StackedLinear, StackedPReLU, activate_and_pool, stacked_perceptron
+from ljn.nets.layers import OUTPUT_SCALE, StackedLinear, StackedPReLU, activate_and_pool, stacked_perceptron
 from ljn.nets.pointnet import PointNet
 
 
@@ -70,7 +70,10 @@ class LocalJointNetwork(CloudDetector):
         self.group = stacked_perceptron(NUM_JOINTS, group_channels, last_activation=False)
         self.group_activation = StackedPReLU(NUM_JOINTS)
         self.head = stacked_perceptron(
-            NUM_JOINTS, [group_channels[-1], *head_channels, 3], last_activation=False
+            NUM_JOINTS,
+            [group_channels[-1], *head_channels, 3],
+            last_activation=False,
+            last_scale=OUTPUT_SCALE,
         )
 
     def regress(self, points: Tensor, initial_joints: Tensor) -> Tensor:

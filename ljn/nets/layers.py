@@ -12,15 +12,24 @@ from torch.nn import functional
 LayerT = TypeVar("LayerT", bound=Any)
 
 
-def perceptron(channels: Sequence[int], last_activation: bool = True) -> nn.Sequential:
-    """Linear layers with a PReLU after each (after the last one on request).
+PRELU_SLOPE = 0.25
+"""Slope of a PReLU's negative side before training."""
+OUTPUT_SCALE = 0.1
+"""Of the weights of last layers (see `initialise`): outputs begin near zero, offsets near none."""
+
+
+def perceptron(
+    channels: Sequence[int], last_activation: bool = True, last_scale: float = 1.0
+) -> nn.Sequential:
+    """Linear layers with a PReLU after each (after the last one on request), conditioned by `initialise`.
 
     Applied to `(..., channels[0])`; on a cloud `(B, N, C)` it is PointNet's shared MLP. No batch
     normalisation: batches are small (section 3.6.1).
     """
     layers: list[nn.Module] = []
     for number, (fan_in, fan_out) in enumerate(pairwise(channels), start=1):
-        layers.append(nn.Linear(fan_in, fan_out))
+        scale = last_scale if number == len(channels) - 1 else 1.0
+        layers.append(initialise(nn.Linear(fan_in, fan_out), PRELU_SLOPE, scale))
         if last_activation or number < len(channels) - 1:
             layers.append(nn.PReLU())
     return nn.Sequential(*layers)
@@ -44,9 +53,7 @@ def initialise(layer: LayerT, slope: float = 0.0, scale: float = 1.0) -> LayerT:
 
 
 class StackedLinear(nn.Module):
-    """One linear layer for each joint, run as one batched product.
-
-    Each slice is initialised as an `nn.Linear` of its own.
+    """One linear layer for each joint, run as one batched product, conditioned by `initialise` for a PReLU.
 
     Args:
         num_joints: K.
@@ -58,10 +65,7 @@ class StackedLinear(nn.Module):
         super().__init__()
         self.weight = nn.Parameter(torch.empty(num_joints, fan_out, fan_in))
         self.bias = nn.Parameter(torch.empty(num_joints, fan_out))
-        bound = 1 / math.sqrt(fan_in)
-        for weight, bias in zip(self.weight, self.bias):
-            nn.init.uniform_(weight, -bound, bound)
-            nn.init.uniform_(bias, -bound, bound)
+        initialise(self, PRELU_SLOPE)
 
     def forward(self, x: Tensor) -> Tensor:
         """`(K, M, fan_in)` -> `(K, M, fan_out)`."""
@@ -73,7 +77,7 @@ class StackedPReLU(nn.Module):
 
     def __init__(self, num_joints: int) -> None:
         super().__init__()
-        self.weight = nn.Parameter(torch.full((num_joints,), 0.25))
+        self.weight = nn.Parameter(torch.full((num_joints,), PRELU_SLOPE))
 
     def forward(self, x: Tensor) -> Tensor:
         """`(K, ...)` -> `(K, ...)`."""
@@ -81,12 +85,13 @@ class StackedPReLU(nn.Module):
 
 
 def stacked_perceptron(
-    num_joints: int, channels: Sequence[int], last_activation: bool = True
+    num_joints: int, channels: Sequence[int], last_activation: bool = True, last_scale: float = 1.0
 ) -> nn.Sequential:
     """`perceptron` for each joint: `(K, M, channels[0])` -> `(K, M, channels[-1])`."""
     layers: list[nn.Module] = []
     for number, (fan_in, fan_out) in enumerate(pairwise(channels), start=1):
-        layers.append(StackedLinear(num_joints, fan_in, fan_out))
+        scale = last_scale if number == len(channels) - 1 else 1.0
+        layers.append(initialise(StackedLinear(num_joints, fan_in, fan_out), PRELU_SLOPE, scale))
         if last_activation or number < len(channels) - 1:
             layers.append(StackedPReLU(num_joints))
     return nn.Sequential(*layers)

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from ljn.geometry.points import ball_group, farthest_point_sampling, gather_points
-from ljn.nets.layers import activate_and_pool, perceptron
+from ljn.nets.layers import PRELU_SLOPE, activate_and_pool, initialise, perceptron
 
 
 class SetAbstraction(nn.Module):
@@ -42,8 +42,14 @@ class SetAbstraction(nn.Module):
         self.unit_m = radius_m if relative_to_radius else 1.0
         self.register_buffer("radius", torch.tensor([radius_m]), persistent=False)
         self.radius: Tensor
+        # One layer on position and feature together, in two parts.
+        first = initialise(nn.Linear(3 + in_channels, channels[0]), PRELU_SLOPE)
         self.position = nn.Linear(3, channels[0], bias=False)
         self.feature = nn.Linear(in_channels, channels[0])
+        self.position.weight.data, self.feature.weight.data = (
+            part.clone() for part in first.weight.data.split([3, in_channels], -1)
+        )
+        nn.init.zeros_(self.feature.bias)
         self.first_activation = nn.PReLU()
         self.rest = perceptron(channels, last_activation=False)
         self.last_activation = nn.PReLU()

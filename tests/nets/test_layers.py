@@ -2,7 +2,7 @@ import pytest
 import torch
 from torch import nn
 
-from ljn.nets.layers import StackedLinear, StackedPReLU, activate_and_pool, perceptron, stacked_perceptron
+from ljn.nets.layers import StackedPReLU, activate_and_pool, perceptron, stacked_perceptron
 
 
 def test_stacked_layers_equal_a_loop_over_the_joints():
@@ -18,15 +18,6 @@ def test_stacked_layers_equal_a_loop_over_the_joints():
         single[2].weight.data = stacked[2].weight.data[joint]
         single[2].bias.data = stacked[2].bias.data[joint]
         torch.testing.assert_close(out[joint], single(x[joint]))
-
-
-def test_each_slice_is_initialised_like_a_linear_layer_of_its_own():
-    torch.manual_seed(0)
-    layer = StackedLinear(24, 400, 50)
-    bound = 400**-0.5
-    assert layer.weight.abs().max() <= bound
-    assert layer.weight.std(dim=(1, 2)).sub(bound / 3**0.5).abs().max() < 0.02 * bound
-    assert not torch.equal(layer.weight[0], layer.weight[1])
 
 
 @pytest.mark.parametrize("slope", [0.25, 0.0, -0.7, 1.5])
