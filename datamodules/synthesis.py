@@ -14,14 +14,16 @@ from datamodules.noise import JOINT_NOISES, add_depth_noise, add_joint_noise, ad
 from datamodules.placement import HEADINGS, check_margin, draw_heading, place
 from datamodules.sources import PoseRecords
 from ljn.body import SMPL, BodyModel
+from ljn.body.skeleton import NUM_JOINTS
 from ljn.cloud.observation import ObservationRecipe, observe, stack_observations
 from ljn.data import Batch
 from ljn.geometry.camera import Camera, project
 from ljn.geometry.rotations import CAMERA_FROM_BODY, rotation_about, rotmat_to_rotvec, rotvec_to_rotmat
+from ljn.pipeline.keypoints import fill_missing
 from ljn.render import RENDERERS, Renderer, get_renderer
 
 # Each purpose has a generator of its own: changing one (the number of points, a sigma) leaves the others' draws.
-_PLACEMENT, _DEPTH_NOISE, _SAMPLING, _KEYPOINTS, _JOINTS = range(5)
+_PLACEMENT, _DEPTH_NOISE, _SAMPLING, _KEYPOINTS, _JOINTS, _MISSING, _CAMERA = range(7)
 
 SAMPLES_VERSION = 1
 """Raised with every change of the samples made of the same records: results are comparable within a version only."""
@@ -37,7 +39,11 @@ class SynthesisSettings:
         distance_m: Range of the depth of the body's centre, metres.
         margin_px: Clear border around the body, pixels.
         depth_noise_m: Standard deviation of the depth noise, metres.
-        keypoint_noise_px: Standard deviation of the keypoints' noise, pixels.
+        keypoint_noise_px: Standard deviation of the keypoints' noise, pixels; of a sample with another focal length, in
+            proportion to it.
+        missing_keypoints: Share of the keypoints that are missing, each by itself; they are filled in from the others.
+        focal_factors: Range of each sample's focal length in the same image, as multiples of the camera's.
+        pixel_factors: Range of each sample's number of pixels along a side, as multiples of the camera's.
         initial_joints: `lifted` (noisy keypoints with the depth at their pixels) or `noised` (true joints with
             noise).
         joint_noise_m: Standard deviation of the noise of `noised`, metres.
@@ -50,6 +56,9 @@ class SynthesisSettings:
     margin_px: float = 8.0
     depth_noise_m: float = 0.001
     keypoint_noise_px: float = 10.0
+    missing_keypoints: float = 0.0
+    focal_factors: tuple[float, float] = (1.0, 1.0)
+    pixel_factors: tuple[float, float] = (1.0, 1.0)
     initial_joints: str = "lifted"
     joint_noise_m: float = 0.02
     joint_noise: str = "planar"
@@ -65,18 +74,30 @@ class SynthesisSettings:
         for name, known in choices.items():
             if getattr(self, name) not in known:
                 raise ValueError(f"{name}: expected one of {', '.join(known)}, got '{getattr(self, name)}'")
-        if not isinstance(self.distance_m, Sequence) or len(self.distance_m) != 2:
-            raise ValueError(
-                f"distance_m: expected two numbers, nearest and farthest, got {self.distance_m!r}"
-            )
-        if not 0 < self.distance_m[0] <= self.distance_m[1]:
-            raise ValueError(f"distance_m: expected 0 < nearest <= farthest, got {self.distance_m}")
-        for name in ("margin_px", "depth_noise_m", "keypoint_noise_px", "joint_noise_m"):
+        for name in ("distance_m", "focal_factors", "pixel_factors"):
+            values = getattr(self, name)
+            if not isinstance(values, Sequence) or len(values) != 2:
+                raise ValueError(f"{name}: expected two numbers, lowest and highest, got {values!r}")
+            if not 0 < values[0] <= values[1]:
+                raise ValueError(f"{name}: expected 0 < lowest <= highest, got {values}")
+            object.__setattr__(self, name, tuple(map(float, values)))
+        for name in ("margin_px", "depth_noise_m", "keypoint_noise_px", "joint_noise_m", "missing_keypoints"):
             value = getattr(self, name)
             if not (isinstance(value, int | float) and math.isfinite(value) and value >= 0):
                 raise ValueError(f"{name}: expected a number of 0 or more, got {value!r}")
             object.__setattr__(self, name, float(value))  # so that 10 and 10.0 make the same set of samples
-        object.__setattr__(self, "distance_m", tuple(map(float, self.distance_m)))
+        if self.missing_keypoints > 1:
+            raise ValueError(
+                f"missing_keypoints: expected a share of at most 1, got {self.missing_keypoints}"
+            )
+
+    def smallest(self, camera: Camera) -> Camera:
+        """The camera with the smallest image and the narrowest view that a sample may have."""
+        return _varied(camera, self.focal_factors[1], self.pixel_factors[0])
+
+    def densest_focal_px(self, camera: Camera) -> float:
+        """The longest focal length that a sample may have, pixels."""
+        return camera.fx * self.focal_factors[1] * self.pixel_factors[1]
 
 
 class DepthSynthesizer:
@@ -110,7 +131,7 @@ class DepthSynthesizer:
             raise ValueError(
                 "heading: these poses carry no heading of their own; use 'histogram' or 'uniform'"
             )
-        check_margin(camera, settings.margin_px)
+        check_margin(settings.smallest(camera), settings.margin_px)
         self.records = records
         self.bodies = bodies
         self.camera = camera
@@ -143,14 +164,21 @@ class DepthSynthesizer:
         return self._observe(keys, self._render(keys))
 
     def examples(self, keys: Sequence[tuple[int, int]]) -> tuple[Batch, Tensor]:
-        """The samples of `keys` with the noisy depth images `(B, H, W)`, metres, that they were taken from."""
+        """The samples of `keys` with the noisy depth images `(B, H, W)`, metres, that they were taken from.
+
+        Smaller images lie in the upper left corner.
+        """
         scene = self._render(keys)
-        return self._observe(keys, scene), torch.from_numpy(scene.depth)
+        depth = torch.zeros(len(keys), *np.max([image.shape for image in scene.depth], 0))
+        for whole, image in zip(depth, scene.depth):
+            whole[: image.shape[0], : image.shape[1]] = torch.from_numpy(image)
+        return self._observe(keys, scene), depth
 
     @torch.no_grad()
     def _render(self, keys: Sequence[tuple[int, int]]) -> "_Scene":
         """Pose the bodies, place them before the camera, take noisy depth images."""
-        settings, camera = self.settings, self.camera
+        settings = self.settings
+        cameras = [self._camera_of(*key) for key in keys]
         placement = [self._rng(epoch, index, _PLACEMENT) for epoch, index in keys]
         rows = [index for _, index in keys]
         pose = torch.from_numpy(self.records.pose[rows]).to(self.dtype)
@@ -167,31 +195,50 @@ class DepthSynthesizer:
             np.stack(
                 [
                     place(mesh, camera, rng.random(3), settings.distance_m, settings.margin_px)
-                    for mesh, rng in zip(vertices.numpy(), placement)
+                    for mesh, camera, rng in zip(vertices.numpy(), cameras, placement)
                 ]
             )
         ).to(self.dtype)
         vertices, joints = vertices + transl[:, None], joints + transl[:, None]
 
-        depth = self._renderer(vertices, self._smpl.faces, camera).numpy()
+        depth = self._images(vertices, cameras)
         for image, (epoch, index) in zip(depth, keys):
             add_depth_noise(
                 image, settings.depth_noise_m, self._rng(epoch, index, _DEPTH_NOISE), in_place=True
             )
-        return _Scene(pose, betas, gender, joints, depth)
+        return _Scene(pose, betas, gender, joints, cameras, depth)
+
+    def _camera_of(self, epoch: int, index: int) -> Camera:
+        """The camera of a sample."""
+        ranges = (self.settings.focal_factors, self.settings.pixel_factors)
+        if all(low == high == 1 for low, high in ranges):
+            return self.camera
+        rng = self._rng(epoch, index, _CAMERA)
+        factors = [math.exp(rng.uniform(math.log(low), math.log(high))) for low, high in ranges]
+        return _varied(self.camera, *factors)
+
+    def _images(self, vertices: Tensor, cameras: Sequence[Camera]) -> list[np.ndarray]:
+        """The depth images of meshes, each by its camera: all at once where that is the same."""
+        if len(set(cameras)) == 1:
+            return list(self._renderer(vertices, self._smpl.faces, cameras[0]).numpy())
+        return [
+            self._renderer(mesh[None], self._smpl.faces, camera)[0].numpy()
+            for mesh, camera in zip(vertices, cameras)
+        ]
 
     def _observe(self, keys: Sequence[tuple[int, int]], scene: "_Scene") -> Batch:
         """Observe the depth images; add the truth."""
-        settings, camera = self.settings, self.camera
-        intrinsics = camera.intrinsics(self.dtype).expand(len(keys), 4)
+        settings = self.settings
+        intrinsics = torch.stack([camera.intrinsics(self.dtype) for camera in scene.cameras])
         keypoints = project(scene.joints, intrinsics).float()
         observations = []
         for i, (epoch, index) in enumerate(keys):
-            noisy = add_keypoint_noise(
-                keypoints[i].numpy(), settings.keypoint_noise_px, self._rng(epoch, index, _KEYPOINTS)
-            )
+            camera = scene.cameras[i]
+            noise_px = settings.keypoint_noise_px * camera.fx / self.camera.fx
+            noisy = add_keypoint_noise(keypoints[i].numpy(), noise_px, self._rng(epoch, index, _KEYPOINTS))
+            kept, confidences = self._kept(noisy, epoch, index)
             sampling = self._rng(epoch, index, _SAMPLING)
-            made = observe(scene.depth[i], camera, noisy, self.recipe, self.takes, sampling)
+            made = observe(scene.depth[i], camera, kept, self.recipe, self.takes, sampling, confidences)
             if settings.initial_joints == "noised":
                 made["initial_joints"] = add_joint_noise(
                     scene.joints[i].numpy(),
@@ -211,15 +258,42 @@ class DepthSynthesizer:
             sample_id=torch.tensor([index for _, index in keys]),
         )
 
+    def _kept(
+        self, keypoints: np.ndarray, epoch: int, index: int
+    ) -> tuple[np.ndarray | None, np.ndarray | None]:
+        """Keypoints, those that are missing filled in, and confidences; None where none is left."""
+        if self.settings.missing_keypoints == 0:
+            return keypoints, None
+        draws = self._rng(epoch, index, _MISSING).random(NUM_JOINTS)
+        is_kept = draws >= self.settings.missing_keypoints
+        if not is_kept.any():
+            return None, None
+        return fill_missing(np.where(is_kept[:, None], keypoints, np.nan)), is_kept.astype(np.float32)
+
+
+def _varied(camera: Camera, focal_factor: float, pixel_factor: float) -> Camera:
+    """A camera with another focal length in an image of the same shape, then with another number of pixels."""
+    width, height = (max(1, round(size * pixel_factor)) for size in (camera.width, camera.height))
+    along_u, along_v = width / camera.width, height / camera.height
+    return Camera(
+        camera.fx * focal_factor * along_u,
+        camera.fy * focal_factor * along_v,
+        (camera.cx + 0.5) * along_u - 0.5,
+        (camera.cy + 0.5) * along_v - 0.5,
+        width,
+        height,
+    )
+
 
 class _Scene(NamedTuple):
-    """Bodies before the camera: `(B, 72)`, `(B, 10)`, `(B,)`, `(B, 24, 3)` and noisy depth `(B, H, W)`, metres."""
+    """Bodies before their cameras: `(B, 72)`, `(B, 10)`, `(B,)`, `(B, 24, 3)`; noisy depth `(H, W)` each, metres."""
 
     pose: Tensor
     betas: Tensor
     gender: Tensor
     joints: Tensor
-    depth: np.ndarray
+    cameras: list[Camera]
+    depth: list[np.ndarray]
 
 
 def concatenate(batches: Iterable[Batch], num_samples: int) -> dict[str, Tensor]:

@@ -80,7 +80,7 @@ class SyntheticDepthDataModule(DataModule):
         prefetch_batches: int = 4,
     ) -> None:
         super().__init__()
-        check_margin(camera, synthesis.margin_px)
+        check_margin(synthesis.smallest(camera), synthesis.margin_px)
         self.camera = camera
         # A detector moves the lifted joints.
         self.synthesis = replace(synthesis, initial_joints="lifted") if detector_ckpt else synthesis
@@ -115,7 +115,8 @@ class SyntheticDepthDataModule(DataModule):
     @property
     def recipe(self) -> ObservationRecipe:
         """See `DataModule`."""
-        return replace(self.observation, spacing_m=self.synthesis.distance_m[0] / self.camera.fx)
+        focal = self.synthesis.densest_focal_px(self.camera)
+        return replace(self.observation, spacing_m=self.synthesis.distance_m[0] / focal)
 
     @property
     def fingerprint(self) -> str:

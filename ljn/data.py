@@ -23,6 +23,7 @@ class Batch(TypedDict, total=False):
         crop: `(B, P, P)`.
         crop_camera: `(B, 4)`.
         keypoints: `(B, 24, 2)`, with noise.
+        confidences: `(B, 24)`, 0 where a keypoint is missing.
         initial_joints: `(B, 24, 3)`: keypoints lifted with the depth image, or what stands in their place.
         true_keypoints: `(B, 24, 2)`, true joints projected, pixels.
         joints: `(B, 24, 3)`, true joints, metres, camera frame.
@@ -37,6 +38,7 @@ class Batch(TypedDict, total=False):
     crop: Tensor
     crop_camera: Tensor
     keypoints: Tensor
+    confidences: Tensor
     initial_joints: Tensor
     true_keypoints: Tensor
     joints: Tensor

@@ -9,12 +9,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ljn.body.skeleton import NUM_JOINTS
 from ljn.cloud.lifting import lift_keypoints
 from ljn.cloud.normals import NORMALS, get_normal_estimator
 from ljn.cloud.sampling import sample_cloud
 from ljn.geometry.camera import Camera
 
-PARTS = ("points", "crop", "crop_camera", "keypoints", "initial_joints")
+PARTS = ("points", "crop", "crop_camera", "keypoints", "confidences", "initial_joints")
 """What an observation may hold; a network names, in its `takes`, which of them it is called with."""
 _CROP_MARGIN, _CROP_BORDER_PX = (
     1.1,
@@ -30,6 +31,7 @@ class Observation(TypedDict, total=False):
         crop: `(P, P)`: the depth of a square around the body, 0 where it is not seen.
         crop_camera: `(4,)`: fx, fy, cx, cy of the crop, in its own pixels; the camera frame is that of the image.
         keypoints: `(24, 2)`: u and v of the 2D joints, clipped to the image.
+        confidences: `(24,)`: of the keypoints; 0 where there is none, and what stands in its place is a guess.
         initial_joints: `(24, 3)`: the keypoints lifted with the depth image.
     """
 
@@ -37,6 +39,7 @@ class Observation(TypedDict, total=False):
     crop: np.ndarray
     crop_camera: np.ndarray
     keypoints: np.ndarray
+    confidences: np.ndarray
     initial_joints: np.ndarray
 
 
@@ -76,6 +79,7 @@ def observe(
     recipe: ObservationRecipe,
     takes: Collection[str],
     rng: np.random.Generator,
+    confidences: np.ndarray | None = None,
 ) -> Observation:
     """Make what a network takes of one depth image.
 
@@ -86,10 +90,12 @@ def observe(
     Args:
         depth: `(H, W)` float32, metres; 0 is background.
         camera: The camera of this image.
-        keypoints: `(24, 2)`, u and v, pixels, finite; None where there are none.
+        keypoints: `(24, 2)`, u and v, pixels, finite; None where there are none: all in the middle of the body then, of
+            confidence 0, for a network that takes confidences.
         recipe: How it is made.
         takes: Which of `PARTS` to make.
         rng: Source of the choice of points.
+        confidences: `(24,)`, of the keypoints; None: all 1.
 
     Raises:
         ValueError: The mask is empty, `takes` names something else, or keypoints are wanted and there are none.
@@ -101,11 +107,18 @@ def observe(
         made["points"] = _cloud(depth, camera, recipe, rng)
     if "crop" in takes or "crop_camera" in takes:
         made["crop"], made["crop_camera"] = crop_body(depth, camera, recipe.crop_px)
-    if "keypoints" in takes or "initial_joints" in takes:
+    if {"keypoints", "confidences", "initial_joints"} & set(takes):
         if keypoints is None:
-            raise ValueError("keypoints: expected those of the 24 joints, which this network takes, got none")
+            if "confidences" not in takes:
+                raise ValueError(
+                    "keypoints: expected those of the 24 joints, which this network takes, got none"
+                )
+            keypoints, confidences = _no_keypoints(depth)
         corner = np.array([camera.width - 1, camera.height - 1], np.float32)
         made["keypoints"] = np.asarray(keypoints, np.float32).clip(0, corner)
+    if "confidences" in takes:
+        is_there = np.ones(NUM_JOINTS) if confidences is None else confidences
+        made["confidences"] = np.asarray(is_there, np.float32)
     if "initial_joints" in takes:
         made["initial_joints"] = lift_keypoints(made["keypoints"], depth, camera)
     return made
@@ -159,6 +172,13 @@ def _cloud(
     cloud = sample_cloud(depth, camera, recipe.num_points, rng)
     normals = get_normal_estimator(recipe.normals)(cloud, depth, camera)
     return np.concatenate([cloud.points, normals], -1)
+
+
+def _no_keypoints(depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Keypoints in the middle of the body, and their confidences of 0."""
+    left, right, top, bottom = _box(depth)
+    middle = np.array([(left + right) / 2, (top + bottom) / 2], np.float32)
+    return np.tile(middle, (NUM_JOINTS, 1)), np.zeros(NUM_JOINTS)
 
 
 def _every(step: int, depth: np.ndarray, camera: Camera) -> tuple[np.ndarray, Camera]:

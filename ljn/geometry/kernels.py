@@ -1,6 +1,6 @@
-"""Grouping on the CPU, compiled by numba: what `ljn.geometry.points` runs where the tensors are on a CPU.
+"""Grouping and patches on the CPU, compiled by numba: what `ljn.geometry.points` and `patches` run there.
 
-Each follows the tensor form's arithmetic and order to the last bit, so that both give the same indices.
+Each follows the tensor form's arithmetic and order to the last bit, so that both give the same values.
 """
 
 import numba
@@ -51,3 +51,58 @@ def ball_group(points: np.ndarray, centres: np.ndarray, squared_radii: np.ndarra
             else:
                 for slot in range(count, group_size):
                     index[b, m, slot] = index[b, m, slot - count]
+
+
+@numba.njit(cache=True, nogil=True)
+def patch_squares(
+    crop: np.ndarray,
+    crop_camera: np.ndarray,
+    points: np.ndarray,
+    scales: np.ndarray,
+    offsets: np.ndarray,
+    limits: np.ndarray,
+    out: np.ndarray,
+) -> None:
+    """Write `ljn.geometry.patches.patch_squares` into `out`, which is zero; `scales` `(S, 2)` holds sizes and units.
+
+    `offsets` `(p,)` are the samples' places along a patch of width 1 about its middle; `limits` `(2,)` are the nearest
+    depth of a point and the farthest of a sample, in its unit.
+    """
+    side, patch_px = crop.shape[1], len(offsets)
+    square_px = 4
+    per_row, area = patch_px // square_px, square_px * square_px
+    nearest, clip = limits
+    columns = np.empty(patch_px, np.int64)
+    for b in range(points.shape[0]):
+        fx, fy, cx, cy = crop_camera[b, 0], crop_camera[b, 1], crop_camera[b, 2], crop_camera[b, 3]
+        for k in range(points.shape[1]):
+            z = max(points[b, k, 2], nearest)
+            u, v = points[b, k, 0] / z * fx + cx, points[b, k, 1] / z * fy + cy
+            for s in range(len(scales)):
+                size, unit = scales[s, 0], scales[s, 1]
+                wide, high = size * fx / z, size * fy / z
+                for j in range(patch_px):
+                    columns[j] = _pixel(u + offsets[j] * wide, side)
+                start = s * 2 * area
+                for i in range(patch_px):
+                    row = _pixel(v + offsets[i] * high, side)
+                    if row < 0:
+                        continue
+                    for j in range(patch_px):
+                        column = columns[j]
+                        if column < 0 or not crop[b, row, column] > 0:
+                            continue
+                        square = (i // square_px) * per_row + j // square_px
+                        slot = start + (i % square_px) * square_px + j % square_px
+                        relative = (crop[b, row, column] - z) / unit
+                        out[b, k, square, slot] = min(max(relative, -clip), clip)
+                        out[b, k, square, slot + area] = 1
+
+
+@numba.njit(cache=True, nogil=True)
+def _pixel(position: float, side: int) -> int:
+    """The nearest pixel, -1 outside the image (or where the position is not a number)."""
+    if not -1 < position < side:
+        return -1
+    pixel = int(np.rint(position))
+    return pixel if pixel < side else -1

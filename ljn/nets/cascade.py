@@ -2,7 +2,7 @@
 
 Each pass cuts, from a crop of the depth image, square patches around the joints' present estimates, so wide in space
 whatever the distance and the camera, and moves every joint by what it sees there and by what all joints and the whole
-crop say. It starts from lifted keypoints, or from a first guess that the crop alone gives.
+crop say. It starts from lifted keypoints, or, joint by joint where there are none, from a first guess of the crop.
 """
 
 from collections.abc import Sequence
@@ -12,24 +12,26 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from ljn.body.skeleton import NUM_JOINTS
+from ljn.geometry.patches import NEAREST_M, SQUARE, patch_squares
 from ljn.nets.detector import Detector
 from ljn.nets.layers import StackedLinear, initialise
 
-STARTS = ("keypoints", "crop")
-_SQUARE = 4  # samples along a square's side: patches are read square by square
+STARTS = ("keypoints", "either")
 _UNIT_M = 0.25  # of depth in a patch, relative to the joint; wider patches have a wider one
 _STEP_M = 0.3  # of a pass's output
 _GUESS_DEPTH_M = 0.5  # of the first guess's depth, about the body's mean
-_NEAREST_M = 0.1
 
 
 class PatchCascade(Detector):
     """The cascade.
 
     Args:
-        start: `keypoints` (the initial joints) or `crop` (a first guess of the crop; no keypoints are taken).
+        start: `keypoints` (the initial joints) or `either` (those of them that there are, for the others a first guess
+            of the crop: keypoints may be missing, some or all).
         patch_sizes_m: Width of each pass's patches at the joint's depth, metres.
         guess_size_m: That of a further pass that a first guess goes through first.
+        keypoint_dropout: Share of the training samples that lose keypoints, each keypoint with a probability that is
+            uniform between 0 and 1; with `either` alone, where every sample is learned without any, too.
         patch_scales: Every pass looks at patches of these multiples of its width.
         patch_px: Samples along a patch's side, a multiple of 4.
         square_channels: Width of the layer that reads a patch's squares, the same for all joints.
@@ -44,9 +46,10 @@ class PatchCascade(Detector):
 
     def __init__(
         self,
-        start: str = "keypoints",
+        start: str = "either",
         patch_sizes_m: Sequence[float] = (0.5, 0.4, 0.32, 0.26),
         guess_size_m: float = 0.8,
+        keypoint_dropout: float = 0.5,
         patch_scales: Sequence[float] = (1.0, 2.5),
         patch_px: int = 12,
         square_channels: int = 32,
@@ -58,24 +61,19 @@ class PatchCascade(Detector):
         super().__init__()
         if start not in STARTS:
             raise ValueError(f"start: expected one of {', '.join(STARTS)}, got '{start}'")
-        if patch_px < _SQUARE or patch_px % _SQUARE:
-            raise ValueError(f"patch_px: expected a multiple of {_SQUARE}, got {patch_px}")
+        if patch_px < SQUARE or patch_px % SQUARE:
+            raise ValueError(f"patch_px: expected a multiple of {SQUARE}, got {patch_px}")
         if not patch_sizes_m:
             raise ValueError("patch_sizes_m: expected at least one pass, got none")
+        if not 0 <= keypoint_dropout <= 1:
+            raise ValueError(f"keypoint_dropout: expected a share between 0 and 1, got {keypoint_dropout}")
         self.start = start
-        self.takes = ("crop", "crop_camera", *(("initial_joints",) if start == "keypoints" else ()))
+        self.keypoint_dropout = keypoint_dropout
+        self.takes = ("crop", "crop_camera", "initial_joints", *(("confidences",) * (start == "either")))
         self.encoder = CropEncoder(crop_channels, encoder_channels)
-        sizes = [*patch_sizes_m]
-        if start == "crop":
-            self.guess = nn.Sequential(
-                initialise(nn.Linear(crop_channels, 2 * crop_channels)),
-                nn.LayerNorm(2 * crop_channels),
-                nn.GELU(),
-                initialise(nn.Linear(2 * crop_channels, 3 * NUM_JOINTS), scale=0.1),
-            )
-            sizes = [guess_size_m, *sizes]
-        self.passes = nn.ModuleList(
-            PatchPass(
+
+        def patch_pass(size: float) -> PatchPass:
+            return PatchPass(
                 [size * scale for scale in patch_scales],
                 [_UNIT_M if scale == 1 else size * scale / 2 for scale in patch_scales],
                 patch_px,
@@ -84,24 +82,36 @@ class PatchCascade(Detector):
                 crop_channels,
                 context_channels,
             )
-            for size in sizes
-        )
 
-    def forward(self, crop: Tensor, crop_camera: Tensor, initial_joints: Tensor | None = None) -> Tensor:
+        if start == "either":
+            self.guess = nn.Sequential(
+                initialise(nn.Linear(crop_channels, 2 * crop_channels)),
+                nn.LayerNorm(2 * crop_channels),
+                nn.GELU(),
+                initialise(nn.Linear(2 * crop_channels, 3 * NUM_JOINTS), scale=0.1),
+            )
+            self.guess_pass = patch_pass(guess_size_m)
+        self.passes = nn.ModuleList(map(patch_pass, patch_sizes_m))
+
+    def forward(
+        self, crop: Tensor, crop_camera: Tensor, initial_joints: Tensor, confidences: Tensor | None = None
+    ) -> Tensor:
         """Joints `(B, 24, 3)` after the last pass; arguments as in `estimates`."""
-        return self.estimates(crop, crop_camera, initial_joints)[-1]
+        return self.estimates(crop, crop_camera, initial_joints, confidences)[-1]
 
     def estimates(  # type: ignore[override]
-        self, crop: Tensor, crop_camera: Tensor, initial_joints: Tensor | None = None
+        self, crop: Tensor, crop_camera: Tensor, initial_joints: Tensor, confidences: Tensor | None = None
     ) -> Tensor:
-        """Joints after the first guess, if there is one, and after every pass.
+        """Joints after the first guess and its pass, if there are any, and after every other pass.
 
-        No gradient passes from one pass to the one before.
+        No gradient passes from one pass to the one before. In training with `either`, every sample goes through the
+        passes twice, without keypoints and with some or all of them: estimates of both are given, in this order.
 
         Args:
             crop: `(B, P, P)`, depth, metres, 0 outside the body; P a multiple of 2.
             crop_camera: `(B, 4)`: fx, fy, cx, cy of the crop.
-            initial_joints: `(B, 24, 3)`, metres, camera frame; None where the start is the crop.
+            initial_joints: `(B, 24, 3)`, metres, camera frame.
+            confidences: `(B, 24)`, 0 where there is no keypoint and the initial joint means nothing; None: all there.
 
         Returns:
             `(T, B, 24, 3)`, metres, camera frame.
@@ -109,18 +119,32 @@ class PatchCascade(Detector):
         is_body = crop > 0
         depth = (crop * is_body).sum((1, 2)) / is_body.sum((1, 2)).clamp(min=1)  # (B,), the body's mean
         feature = self.encoder(crop, crop_camera, depth)
+        joints = initial_joints
+        is_given = torch.ones_like(joints[..., 0]) if confidences is None else (confidences > 0).to(joints)
         estimates = []
-        if self.start == "crop":
+        if self.start == "either":
             guess = self.guess(feature).unflatten(-1, (NUM_JOINTS, 3))
-            joints = _from_crop(guess, crop_camera, depth, crop.shape[-1])
-            estimates.append(joints)
-        else:
-            assert initial_joints is not None
-            joints = initial_joints
+            guess = _from_crop(guess, crop_camera, depth, crop.shape[-1])
+            found = self.guess_pass(crop, crop_camera, guess.detach(), torch.zeros_like(is_given), feature)
+            estimates += [guess, found]
+            if self.training:
+                is_given = torch.cat([torch.zeros_like(is_given), self._dropped(is_given)])
+                crop, crop_camera, feature, joints, found = (
+                    torch.cat([part, part]) for part in (crop, crop_camera, feature, joints, found)
+                )
+            joints = torch.where(is_given[..., None] > 0, joints, found)
+        refined = []
         for patch_pass in self.passes:
-            joints = patch_pass(crop, crop_camera, joints.detach(), feature)
-            estimates.append(joints)
-        return torch.stack(estimates)
+            joints = patch_pass(crop, crop_camera, joints.detach(), is_given, feature)
+            refined.append(joints)
+        # (both starts * passes, B, 24, 3) in training, else (passes, B, 24, 3)
+        starts = torch.stack(refined).unflatten(1, (-1, len(initial_joints))).transpose(0, 1).flatten(0, 1)
+        return torch.cat([torch.stack(estimates), starts]) if estimates else starts
+
+    def _dropped(self, is_given: Tensor) -> Tensor:
+        """`(B, 24)` less the keypoints that training takes away."""
+        share = torch.rand_like(is_given[:, :1]) * (torch.rand_like(is_given[:, :1]) < self.keypoint_dropout)
+        return is_given * (torch.rand_like(is_given) >= share)
 
 
 class CropEncoder(nn.Module):
@@ -146,10 +170,9 @@ class CropEncoder(nn.Module):
 
     def forward(self, crop: Tensor, crop_camera: Tensor, depth: Tensor) -> Tensor:
         """`(B, C)` from a crop, its camera and the body's mean depth `(B,)`."""
-        cells = crop.unflatten(1, (-1, 2)).unflatten(3, (-1, 2))  # (B, P / 2, 2, P / 2, 2)
-        count = (cells > 0).sum((2, 4))
+        count = _cells((crop > 0).to(crop.dtype))
         is_body = count >= 2
-        mean = cells.sum((2, 4)) / count.clamp(min=1)
+        mean = _cells(crop) / count.clamp(min=1)
         relative = torch.where(is_body, mean - depth[:, None, None], 0.0)
         step = (4 * depth / crop_camera[:, 0])[:, None, None]  # metres from one neighbour to the other
         along_u = torch.where(
@@ -191,77 +214,54 @@ class PatchPass(nn.Module):
     ) -> None:
         super().__init__()
         self.sizes_m, self.units_m, self.patch_px = list(sizes_m), list(units_m), patch_px
-        squares = (patch_px // _SQUARE) ** 2
+        squares = (patch_px // SQUARE) ** 2
         hidden, out = joint_channels
-        self.square = initialise(nn.Linear(2 * _SQUARE**2 * len(self.sizes_m), square_channels))
+        self.square = initialise(nn.Linear(2 * SQUARE**2 * len(self.sizes_m), square_channels))
         self.joint_in = initialise(StackedLinear(NUM_JOINTS, squares * square_channels, hidden))
         self.joint_norm = nn.LayerNorm(hidden)
         self.joint_out = initialise(StackedLinear(NUM_JOINTS, hidden, out))
-        self.context = initialise(nn.Linear(3 * NUM_JOINTS + crop_channels, context_channels))
+        self.context = initialise(nn.Linear(4 * NUM_JOINTS + crop_channels, context_channels))
         self.context_norm = nn.LayerNorm(context_channels)
-        self.head_in = initialise(StackedLinear(NUM_JOINTS, out + context_channels, context_channels))
+        self.head_in = initialise(StackedLinear(NUM_JOINTS, out + 1 + context_channels, context_channels))
         self.head_norm = nn.LayerNorm(context_channels)
         self.head_out = initialise(StackedLinear(NUM_JOINTS, context_channels, 3), scale=0.1)
 
-    def forward(self, crop: Tensor, crop_camera: Tensor, joints: Tensor, feature: Tensor) -> Tensor:
-        """The joints moved: `(B, P, P)`, `(B, 4)`, `(B, 24, 3)`, `(B, C)` -> `(B, 24, 3)`."""
-        squares = [
-            _squares(depth_patches(crop, crop_camera, joints, size, self.patch_px, unit))
-            for size, unit in zip(self.sizes_m, self.units_m)
-        ]  # (B, 24, squares, 32) each
-        x = functional.relu(self.square(torch.cat(squares, -1))).flatten(2).transpose(0, 1)  # (24, B, C)
+    def forward(
+        self, crop: Tensor, crop_camera: Tensor, joints: Tensor, is_given: Tensor, feature: Tensor
+    ) -> Tensor:
+        """The joints moved.
+
+        Args:
+            crop: See `PatchCascade.estimates`.
+            crop_camera: See `PatchCascade.estimates`.
+            joints: `(B, 24, 3)`, metres, camera frame.
+            is_given: `(B, 24)`, 1 where the cascade started from a keypoint, else 0.
+            feature: `(B, C)`, of the crop.
+
+        Returns:
+            `(B, 24, 3)`.
+        """
+        x = patch_squares(crop, crop_camera, joints, self.sizes_m, self.units_m, self.patch_px)
+        x = functional.relu(self.square(x)).flatten(2).transpose(0, 1)  # (24, B, C)
         x = functional.gelu(self.joint_norm(self.joint_in(x)))
         x = functional.gelu(self.joint_out(x))
         centred = joints - joints.mean(1, keepdim=True)
-        context = self.context_norm(self.context(torch.cat([2 * centred.flatten(1), feature], -1)))
-        x = torch.cat([x, functional.gelu(context).expand(NUM_JOINTS, -1, -1)], -1)
+        context = self.context_norm(self.context(torch.cat([2 * centred.flatten(1), is_given, feature], -1)))
+        context = functional.gelu(context).expand(NUM_JOINTS, -1, -1)
+        x = torch.cat([x, is_given.T[..., None], context], -1)
         x = self.head_out(functional.gelu(self.head_norm(self.head_in(x))))
         return joints + _STEP_M * x.transpose(0, 1)
 
 
-@torch.no_grad()
-def depth_patches(
-    crop: Tensor, crop_camera: Tensor, joints: Tensor, size_m: float, patch_px: int, unit_m: float
-) -> Tensor:
-    """Square patches of a crop around joints: the nearest pixel's depth beside the joint's, and the mask.
-
-    Args:
-        crop: `(B, P, P)`, metres, 0 outside the body.
-        crop_camera: `(B, 4)`.
-        joints: `(B, K, 3)`, metres, camera frame.
-        size_m: Width of a patch at its joint's depth, metres.
-        patch_px: Samples along its side, p.
-        unit_m: Unit of the depths, metres; they are clipped to +-2 units.
-
-    Returns:
-        `(B, K, 2, p, p)`: depth less the joint's (0 outside the body), and 1 on the body.
-    """
-    side = crop.shape[-1]
-    fx, fy, cx, cy = crop_camera[:, None].unbind(-1)  # (B, 1) each
-    x, y, z = joints.unbind(-1)
-    z = z.clamp(min=_NEAREST_M)
-    offsets = (torch.arange(patch_px, device=crop.device) + 0.5) / patch_px - 0.5
-    column = (
-        ((x / z * fx + cx)[..., None] + offsets * (size_m * fx / z)[..., None]).round().long()
-    )  # (B, K, p)
-    row = ((y / z * fy + cy)[..., None] + offsets * (size_m * fy / z)[..., None]).round().long()
-    is_inside = ((column >= 0) & (column < side))[..., None, :] & ((row >= 0) & (row < side))[..., None]
-    index = row.clamp(0, side - 1)[..., None] * side + column.clamp(0, side - 1)[..., None, :]  # (B, K, p, p)
-    depth = crop.flatten(1).gather(1, index.flatten(1)).view_as(index)
-    is_body = is_inside & (depth > 0)
-    relative = ((depth - z[..., None, None]) / unit_m).clamp(-2, 2)
-    return torch.stack([torch.where(is_body, relative, 0.0), is_body.to(crop.dtype)], 2)
-
-
-def _squares(patches: Tensor) -> Tensor:
-    """Patches `(B, K, 2, p, p)` cut into squares: `(B, K, squares, 2 * 4 * 4)`."""
-    cut = patches.unflatten(-1, (-1, _SQUARE)).unflatten(-3, (-1, _SQUARE))  # (B, K, 2, rows, 4, columns, 4)
-    return cut.permute(0, 1, 3, 5, 2, 4, 6).flatten(4).flatten(2, 3)
+def _cells(image: Tensor) -> Tensor:
+    """Sums over cells of 2 x 2 pixels: `(B, P, P)` -> `(B, P / 2, P / 2)`."""
+    rows = image[:, ::2] + image[:, 1::2]
+    return rows[..., ::2] + rows[..., 1::2]
 
 
 def _from_crop(guess: Tensor, crop_camera: Tensor, depth: Tensor, side: int) -> Tensor:
     """Positions in a crop (-1 to 1 across; depth in half metres about the body's mean) in the camera frame."""
     fx, fy, cx, cy = crop_camera[:, None].unbind(-1)
-    z = (_GUESS_DEPTH_M * guess[..., 2] + depth[:, None]).clamp(min=_NEAREST_M)
+    z = (_GUESS_DEPTH_M * guess[..., 2] + depth[:, None]).clamp(min=NEAREST_M)
     u, v = ((0.5 * guess[..., axis] + 0.5) * side - 0.5 for axis in (0, 1))
     return torch.stack([(u - cx) / fx * z, (v - cy) / fy * z, z], -1)

@@ -86,7 +86,9 @@ KEYS: dict[str, Key] = {
     ),
     **_rows("data", _DATA, "camera redraw_each_epoch synthesis observation"),
     **_rows("data.synthesis", _DATA, "_target_ _convert_ heading distance_m margin_px depth_noise_m"),
-    **_rows("data.synthesis", _DATA, "keypoint_noise_px renderer"),
+    **_rows(
+        "data.synthesis", _DATA, "keypoint_noise_px missing_keypoints focal_factors pixel_factors renderer"
+    ),
     **_rows("data.synthesis", _DATA | Key.ONE_STAGE, "initial_joints joint_noise_m joint_noise"),
     **_rows("data.observation", _DATA, "_target_ _convert_ num_points normals crop_px"),
     **_rows("data", Key.THROUGH | Key.CHANGEABLE | Key.ONE_STAGE, "detector_ckpt"),

@@ -83,7 +83,7 @@ def test_a_batch_keeps_its_contract(batch):
         "joints": (12, 24, 3), "pose": (12, 72), "betas": (12, 10), "gender": (12,), "camera": (12, 4),
         "sample_id": (12,),
     }  # fmt: skip
-    assert set(batch) == set(Batch.__annotations__) - {"crop", "crop_camera"} == set(shapes)
+    assert set(batch) == set(Batch.__annotations__) - {"crop", "crop_camera", "confidences"} == set(shapes)
     for name, shape in shapes.items():
         assert batch[name].shape == shape, name
         assert batch[name].dtype == (torch.int64 if name in ("gender", "sample_id") else torch.float32), name
@@ -296,6 +296,48 @@ def test_poses_without_a_heading_of_their_own_cannot_keep_it(make):
         make(heading="source")
 
 
+def test_missing_keypoints_are_filled_in_and_have_no_confidence(make, batch):
+    takes = ("crop", "crop_camera", "confidences")
+    some = make(takes=takes, missing_keypoints=0.5).batch(KEYS)
+    is_kept = some["confidences"] > 0
+    assert 0.4 < is_kept.float().mean() < 0.6
+    assert torch.equal(some["keypoints"][is_kept], batch["keypoints"][is_kept])
+    moved = (some["keypoints"] - batch["keypoints"]).norm(dim=-1)[~is_kept]
+    assert 1 < moved.median() < 40  # a guess, but a near one
+    none = make(takes=takes, missing_keypoints=1).batch(KEYS)
+    assert not none["confidences"].any()
+    assert (none["keypoints"] == none["keypoints"][:, :1]).all()
+    assert torch.equal(make(takes=takes).batch(KEYS)["confidences"], torch.ones(12, 24))
+
+
+def test_a_sample_of_another_camera_is_seen_by_that_camera(make, kinect):
+    changes = {
+        "takes": ("points", "crop", "crop_camera"),
+        "focal_factors": (0.7, 1.3),
+        "pixel_factors": (0.3, 1.2),
+    }
+    changes |= {"depth_noise_m": 0, "keypoint_noise_px": 0}
+    synthesizer = make(**changes)
+    batch, depth = synthesizer.examples(KEYS)
+    fx, _, cx, _ = batch["camera"].unbind(-1)
+    assert fx.min() < 0.6 * kinect.fx < kinect.fx < fx.max()
+    torch.testing.assert_close(project(batch["joints"], batch["camera"]), batch["true_keypoints"])
+    for sample in range(len(KEYS)):
+        image = depth[sample]
+        v, u = image.nonzero(as_tuple=True)
+        rays = (u - cx[sample]) / fx[sample] * image[v, u]
+        points = batch["points"][sample]
+        # Each point of the cloud is a pixel of that image.
+        assert torch.cdist(points[:, [0, 2]], torch.stack([rays, image[v, u]], -1)).amin(1).max() < 2e-3
+        crop, camera = batch["crop"][sample], batch["crop_camera"][sample]
+        v, u = crop.nonzero(as_tuple=True)
+        x = (u - camera[2]) / camera[0] * crop[v, u]
+        assert (x.max() - rays.max()).abs() < 0.03
+        assert (x.min() - rays.min()).abs() < 0.03
+    alone = make(**changes).batch(KEYS[3:4])
+    torch.testing.assert_close(alone["crop"], batch["crop"][3:4])
+
+
 @pytest.mark.parametrize(
     ("settings", "change", "message"),
     [
@@ -306,7 +348,9 @@ def test_poses_without_a_heading_of_their_own_cannot_keep_it(make):
         (ObservationRecipe, {"normals": "pca"}, "normals: expected one of window, knn, open3d, got 'pca'"),
         (SynthesisSettings, {"heading": "front"}, "heading: expected one of source, histogram, uniform, got 'front'"),
         (SynthesisSettings, {"renderer": "opengl"}, "renderer: expected one of auto, zbuffer, torch, .*got 'opengl'"),
-        (SynthesisSettings, {"distance_m": (3.0, 2.0)}, "distance_m: expected 0 < nearest <= farthest"),
+        (SynthesisSettings, {"distance_m": (3.0, 2.0)}, "distance_m: expected 0 < lowest <= highest"),
+        (SynthesisSettings, {"pixel_factors": 0.5}, "pixel_factors: expected two numbers"),
+        (SynthesisSettings, {"missing_keypoints": 2}, "missing_keypoints: expected a share of at most 1"),
         (SynthesisSettings, {"margin_px": -1.0}, "margin_px: expected a number of 0 or more, got -1"),
         (SynthesisSettings, {"keypoint_noise_px": -5.0}, "keypoint_noise_px: expected a number of 0 or more"),
     ],

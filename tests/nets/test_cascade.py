@@ -2,9 +2,8 @@ import pytest
 import torch
 
 from ljn.body import SMPL
-from ljn.geometry.camera import project
 from ljn.geometry.rotations import BODY_TO_OPENGL
-from ljn.nets.cascade import PatchCascade, depth_patches
+from ljn.nets.cascade import PatchCascade
 from ljn.nets.kinematic import KinematicNetwork
 
 SMALL = {
@@ -20,55 +19,68 @@ def observation(size=3, crop_px=64):
     rows = torch.arange(crop_px) - crop_px / 2
     crop = 2 + 0.002 * rows[:, None] + 0.001 * rows + 0.1 * torch.arange(size)[:, None, None]
     crop[:, :5] = crop[:, :, :8] = 0
-    return crop, torch.tensor([60.0, 60, 31.5, 31.5]).expand(size, 4), joints
+    return crop, torch.tensor([60.0, 60, 31.5, 31.5]).expand(size, 4), joints, torch.ones(size, 24)
 
 
-@pytest.mark.parametrize(("start", "steps"), [("keypoints", 2), ("crop", 4)])
-def test_every_step_is_estimated_and_every_parameter_gets_a_gradient(start, steps):
+@pytest.mark.parametrize(("start", "steps", "trained"), [("keypoints", 2, 2), ("either", 4, 6)])
+def test_every_step_is_estimated_and_every_parameter_gets_a_gradient(start, steps, trained):
     torch.manual_seed(0)
     net = PatchCascade(start, **SMALL)
     arguments = observation()[: len(net.takes)]
     estimates = net.estimates(*arguments)
-    assert estimates.shape == (steps, 3, 24, 3)
-    assert torch.equal(net(*arguments), estimates[-1])
+    assert estimates.shape == (trained, 3, 24, 3)
     estimates.square().sum().backward()
     assert [name for name, p in net.named_parameters() if p.grad is None or not p.grad.any()] == []
+    estimates = net.eval().estimates(*arguments)
+    assert estimates.shape == (steps, 3, 24, 3)
+    assert torch.equal(net(*arguments), estimates[-1])
+
+
+def test_a_missing_keypoint_says_nothing_and_one_that_is_there_says_much():
+    torch.manual_seed(0)
+    net = PatchCascade(**SMALL).eval()
+    crop, camera, joints, confidences = observation()
+    confidences[0], confidences[1, 5:] = 0, 0
+    moved = joints + 0.1 * (confidences[..., None] == 0)
+    assert torch.equal(net(crop, camera, joints, confidences), net(crop, camera, moved, confidences))
+    moved = joints + 0.1 * (confidences[..., None] > 0)
+    steps = net(crop, camera, moved, confidences) - net(crop, camera, joints, confidences)
+    assert (steps[1, :5] - 0.1).abs().max() < 0.05
+    assert not steps[0].any()
+
+
+def test_training_learns_each_sample_without_keypoints_and_with_some():
+    torch.manual_seed(0)
+    net = PatchCascade(keypoint_dropout=1.0, **SMALL)
+    crop, camera, joints, confidences = observation(400)
+    *_, bare, bare_last, some, _ = net.estimates(crop, camera, joints, confidences)
+    blind = net.eval().estimates(crop, camera, joints, 0 * confidences)
+    torch.testing.assert_close(torch.stack([bare, bare_last]), blind[-2:])
+    kept = ((some - joints).norm(dim=-1) < (some - blind[1]).norm(dim=-1)).float().mean(1)
+    assert 0.4 < kept.mean() < 0.6
+    assert kept.min() < 0.1
+    assert kept.max() > 0.9
 
 
 def test_steps_start_small_and_keep_their_size():
     torch.manual_seed(0)
-    crop, camera, joints = observation()
-    steps = PatchCascade().estimates(crop, camera, joints) - joints
+    crop, camera, joints, _ = observation()
+    steps = PatchCascade("keypoints").estimates(crop, camera, joints) - joints
     assert 0.01 < steps[0].norm(dim=-1).mean() < 0.1
-
-
-def test_a_patch_shows_the_surface_as_wide_in_space_whatever_the_distance():
-    crop, camera, joints = observation()
-    patches = depth_patches(crop, camera, joints, 0.4, 8, 0.25)
-    for sample, (image, one) in enumerate(zip(crop, joints)):
-        for joint in range(0, 24, 5):
-            z = one[joint, 2]
-            offsets = 0.4 * ((torch.arange(8) + 0.5) / 8 - 0.5)
-            for row in (0, 3, 7):
-                for column in (1, 6):
-                    corner = one[joint] + torch.stack([offsets[column], offsets[row], torch.zeros(())])
-                    u, v = project(corner[None], camera[sample])[0].round().long().tolist()
-                    inside = 0 <= u < 64 and 0 <= v < 64 and image[v, u] > 0
-                    expected = ((image[v, u] - z) / 0.25).clamp(-2, 2) if inside else torch.zeros(())
-                    torch.testing.assert_close(patches[sample, joint, 0, row, column], expected)
-                    assert patches[sample, joint, 1, row, column] == float(inside)
 
 
 def test_moving_body_and_joints_in_depth_moves_the_prediction_with_them():
     torch.manual_seed(0)
     net = PatchCascade(**SMALL).eval()
-    crop, camera, joints = observation()
+    crop, camera, joints, _ = observation()
     # Twice as far with twice the focal length: the same picture of a body twice as deep only in position.
     moved = net(torch.where(crop > 0, crop + 1, 0), camera, joints + torch.tensor([0.0, 0, 1]))
     assert (moved[..., 2] - net(crop, camera, joints)[..., 2] - 1).abs().max() < 0.05
 
 
-@pytest.mark.parametrize("change", [{"start": "rgb"}, {"patch_px": 10}, {"patch_sizes_m": ()}])
+@pytest.mark.parametrize(
+    "change", [{"start": "rgb"}, {"patch_px": 10}, {"patch_sizes_m": ()}, {"keypoint_dropout": 2}]
+)
 def test_impossible_settings_are_errors(change):
     with pytest.raises(ValueError, match=next(iter(change))):
         PatchCascade(**change)
