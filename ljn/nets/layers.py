@@ -35,20 +35,23 @@ def perceptron(
     return nn.Sequential(*layers)
 
 
-def initialise(layer: LayerT, slope: float = 0.0, scale: float = 1.0) -> LayerT:
+def initialise(layer: LayerT, slope: float = 0.0, scale: float = 1.0, fan_in: int | None = None) -> LayerT:
     """Kaiming's initialisation: what comes out is as large as what went in, after a (leaky) ReLU of `slope`.
 
     Args:
-        layer: With `weight` `(out, in)`, `(K, out, in)` or `(out, in, kh, kw)`, and `bias`, which becomes zero.
+        layer: With `weight` `(out, in)`, `(K, out, in)` or `(out, in, kh, kw)`, and `bias`, which becomes zero, or None.
         slope: Of the activation on its negative side: 0.25 for a PReLU, 0 for ReLU and GELU.
         scale: Factor of the weights; a small one for last layers, which then start near their bias.
+        fan_in: Input channels, where the layer is a part of one that has more.
 
     Returns:
         The layer.
     """
-    fan_in = layer.weight[0].numel() if layer.weight.ndim == 4 else layer.weight.shape[-1]
+    if fan_in is None:
+        fan_in = layer.weight[0].numel() if layer.weight.ndim == 4 else layer.weight.shape[-1]
     nn.init.normal_(layer.weight, 0.0, scale * math.sqrt(2 / (1 + slope**2) / fan_in))
-    nn.init.zeros_(layer.bias)
+    if layer.bias is not None:
+        nn.init.zeros_(layer.bias)
     return layer
 
 

@@ -43,13 +43,9 @@ class SetAbstraction(nn.Module):
         self.register_buffer("radius", torch.tensor([radius_m]), persistent=False)
         self.radius: Tensor
         # One layer on position and feature together, in two parts.
-        first = initialise(nn.Linear(3 + in_channels, channels[0]), PRELU_SLOPE)
-        self.position = nn.Linear(3, channels[0], bias=False)
-        self.feature = nn.Linear(in_channels, channels[0])
-        self.position.weight.data, self.feature.weight.data = (
-            part.clone() for part in first.weight.data.split([3, in_channels], -1)
-        )
-        nn.init.zeros_(self.feature.bias)
+        fan_in = 3 + in_channels
+        self.position = initialise(nn.Linear(3, channels[0], bias=False), PRELU_SLOPE, fan_in=fan_in)
+        self.feature = initialise(nn.Linear(in_channels, channels[0]), PRELU_SLOPE, fan_in=fan_in)
         self.first_activation = nn.PReLU()
         self.rest = perceptron(channels, last_activation=False)
         self.last_activation = nn.PReLU()

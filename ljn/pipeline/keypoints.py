@@ -85,7 +85,7 @@ class Keypoints(NamedTuple):
     confidences: np.ndarray
 
 
-def smpl_keypoints(keypoints: Any) -> Keypoints:
+def smpl_keypoints(keypoints: Any, min_known: int = MIN_KNOWN) -> Keypoints:
     """The 24 SMPL joints' keypoints from any order's.
 
     A keypoint is missing where it is None, NaN or (0, 0), or its confidence is under `MIN_CONFIDENCE`.
@@ -94,9 +94,10 @@ def smpl_keypoints(keypoints: Any) -> Keypoints:
         keypoints: 24, 17 or 25 of `[u, v]` or `[u, v, confidence]`, pixels, in an order of `ORDERS`; a mapping from
             an order's names to such entries; `{"order": name, "keypoints": entries}`; or what OpenPose writes, with
             one person.
+        min_known: The fewest joints that have to be known.
 
     Raises:
-        ValueError: Not one of these, or fewer than `MIN_KNOWN` joints are known.
+        ValueError: Not one of these, or fewer joints are known.
     """
     name, table = _parse(keypoints)
     order = ORDERS[name]
@@ -107,9 +108,9 @@ def smpl_keypoints(keypoints: Any) -> Keypoints:
         if rows:
             positions[JOINT_INDEX[joint]] = table[rows, :2].mean(0)
             confidences[JOINT_INDEX[joint]] = table[rows, 2].min()
-    if (num_known := np.count_nonzero(confidences)) < MIN_KNOWN:
+    if (num_known := np.count_nonzero(confidences)) < min_known:
         raise ValueError(
-            f"keypoints: {num_known} joints are known, expected at least {MIN_KNOWN} of the {len(order.joints)} that "
+            f"keypoints: {num_known} joints are known, expected at least {min_known} of the {len(order.joints)} that "
             f"{name} gives: keypoints that are null, NaN, (0, 0) or of a confidence under {MIN_CONFIDENCE} do not "
             "count"
         )

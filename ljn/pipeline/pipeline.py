@@ -15,7 +15,7 @@ from ljn.geometry.rotations import rotmat_to_rotvec
 from ljn.modules.joint_detector import JointDetector
 from ljn.modules.mesh_regressor import MeshRegressor
 from ljn.pipeline.depth import body_depth
-from ljn.pipeline.keypoints import check_place, smpl_keypoints
+from ljn.pipeline.keypoints import MIN_KNOWN, check_place, smpl_keypoints
 from ljn.runs.checkpoints import Checkpoint, load_module
 
 _SEED = 0  # of the choice of points: the same for every image, so that equal input gives equal output
@@ -146,9 +146,10 @@ class Pipeline:
         return cls(detector, _stage(module.to(device), mesh_checkpoint))
 
     @property
-    def takes_keypoints(self) -> bool:
-        """Whether the joint detector needs 2D keypoints."""
-        return "initial_joints" in self.detector.module.takes
+    def needs_keypoints(self) -> bool:
+        """Whether the joint detector cannot do without 2D keypoints."""
+        takes = self.detector.module.takes
+        return "initial_joints" in takes and "confidences" not in takes
 
     def __call__(self, depth: Any, camera: Camera, keypoints: Any = None, mask: Any = None) -> Prediction:
         """Predict from one image, or from a batch of one camera's images.
@@ -157,8 +158,8 @@ class Pipeline:
             depth: `(H, W)` or `(B, H, W)`: floating-point metres, or integer millimetres; 0 where nothing was
                 measured.
             camera: The camera of the images.
-            keypoints: See `smpl_keypoints`; of a batch, one such value for each image. None for a detector that takes
-                none.
+            keypoints: See `smpl_keypoints`; of a batch, one such value for each image. None, or some of them alone, for
+                a detector that can do without.
             mask: `(H, W)` or `(B, H, W)`, not 0 on the person; None where depth is 0 everywhere else already.
 
         Raises:
@@ -189,27 +190,25 @@ class Pipeline:
         metres = body_depth(depth, camera, mask)
         named = None
         if keypoints is not None:
-            named = smpl_keypoints(keypoints)
+            named = smpl_keypoints(keypoints, MIN_KNOWN if self.needs_keypoints else 1)
             check_place(named, metres, camera)
-        elif self.takes_keypoints:
+        elif self.needs_keypoints:
             raise ValueError(
                 "keypoints: expected the person's 2D keypoints, which this joint detector takes, got none; give them, "
-                "or a detector that was trained without: experiment=detector/cascade_no_keypoints"
+                "or a detector that can do without: experiment=detector/cascade"
             )
+        positions, confidences = (None, None) if named is None else named
 
-        def observed(stage: Stage, *more: str) -> Observation:
-            takes = {*stage.module.takes, *more} - {"initial_joints"}
-            if named is not None and stage is self.detector:
-                takes |= {"initial_joints"}
-            rng, positions = np.random.default_rng(_SEED), None if named is None else named.positions
-            return observe(metres, camera, positions, stage.recipe, takes, rng)
+        def observed(stage: Stage, takes: set[str]) -> Observation:
+            rng = np.random.default_rng(_SEED)
+            return observe(metres, camera, positions, stage.recipe, takes, rng, confidences)
 
-        return ObservedFrame(
-            metres,
-            observed(self.detector, "points"),
-            observed(self.regressor) if self.regressor else None,
-            None if named is None else named.confidences,
-        )
+        takes = {*self.detector.module.takes, "points", *(() if named is None else ("initial_joints",))}
+        regressor = None
+        if self.regressor is not None:
+            # Its initial joints are the detector's.
+            regressor = observed(self.regressor, set(self.regressor.module.takes) - {"initial_joints"})
+        return ObservedFrame(metres, observed(self.detector, takes), regressor, confidences)
 
     @torch.inference_mode()
     def predict(self, frames: Sequence[ObservedFrame]) -> Prediction:
@@ -222,9 +221,9 @@ class Pipeline:
         seen = stack_observations([frame.detector for frame in frames])
         joints = detector(_on(detector.device, seen))
         arrays = {"points": seen["points"]}
-        arrays |= {name: seen[name] for name in ("initial_joints", "keypoints") if name in seen}
         confidences = [frame.confidences for frame in frames if frame.confidences is not None]
         if confidences:
+            arrays |= {name: seen[name] for name in ("initial_joints", "keypoints")}
             arrays["confidences"] = torch.from_numpy(np.stack(confidences))
         if self.regressor is not None:
             regressor = self.regressor.module

@@ -63,10 +63,10 @@ def predict(cfg: DictConfig) -> dict[str, float]:
         torch.set_num_threads(cfg.num_threads)
     use_gpu = cfg.trainer.accelerator != "cpu" and torch.cuda.is_available()
     pipeline = Pipeline.load(cfg.ckpt_path, task.mesh_ckpt_path, "cuda" if use_gpu else "cpu")
-    if task.keypoints is None and pipeline.takes_keypoints:
+    if task.keypoints is None and pipeline.needs_keypoints:
         raise ValueError(
             f"task.keypoints: expected a path, since the detector '{cfg.ckpt_path}' takes keypoints, got null; "
-            f"{_COMMAND}, or a detector without: experiment=detector/cascade_no_keypoints"
+            f"{_COMMAND}, or a detector that can do without: experiment=detector/cascade"
         )
 
     results = _predict(pipeline, frames, camera, directory, may_fail=Path(task.input).is_dir())

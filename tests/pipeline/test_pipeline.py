@@ -1,3 +1,4 @@
+import itertools
 import re
 
 import numpy as np
@@ -184,12 +185,18 @@ def test_an_error_in_a_batch_names_the_image(pipeline, given, kinect):
         pipeline(np.stack([depth, depth]), kinect, [keypoints])
 
 
-def test_keypoints_of_some_images_alone_are_an_error(stages, given, kinect):
+def test_a_detector_that_can_do_without_takes_all_keypoints_some_or_none(stages, given, kinect):
     torch.manual_seed(0)
-    detector = JointDetector(PatchCascade("crop", patch_sizes_m=(0.5,))).eval().requires_grad_(False)
+    detector = JointDetector(PatchCascade(patch_sizes_m=(0.5,))).eval().requires_grad_(False)
     pipeline = Pipeline(stages[0]._replace(module=detector))
     depth, keypoints = np.stack([given[0]] * 2), given[1]
-    assert pipeline(depth, kinect).joints.shape == (2, 24, 3)
-    assert pipeline(depth, kinect).keypoints is None
+    without = pipeline(depth, kinect)
+    assert without.joints.shape == (2, 24, 3)
+    assert without.keypoints is None
+    some = np.where(np.arange(24)[:, None] < 3, keypoints, np.nan)
+    found = [pipeline(depth[0], kinect, each) for each in (keypoints, some)]
+    assert [np.count_nonzero(each.confidences) for each in found] == [24, 3]
+    joints = [without.joints[0], *(each.joints for each in found)]
+    assert min(np.abs(a - b).max() for a, b in itertools.combinations(joints, 2)) > 0.01
     with pytest.raises(ValueError, match="keypoints: some images of the batch have them"):
         pipeline(depth, kinect, [None, keypoints])

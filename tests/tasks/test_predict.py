@@ -148,7 +148,7 @@ def test_keypoints_are_needed_where_the_detector_takes_them_alone(config, write_
         ValueError, match=r"task\.keypoints: expected a path, since the detector .* takes keypoints"
     ):
         predict(config("task.keypoints=null"))
-    detector = write_checkpoint("detector/cascade_no_keypoints", "model.patch_sizes_m=[0.5]")
+    detector = write_checkpoint("detector/cascade", "model.patch_sizes_m=[0.5]")
     mesh = write_checkpoint("mesh/kinematic", "model.channels=16")
     changes = ("task.keypoints=null", f"ckpt_path={detector}", f"task.mesh_ckpt_path={mesh}")
     assert predict(config(*changes))["predict/frames"] == 1
