@@ -39,9 +39,10 @@ class SynthesisSettings:
         distance_m: Range of the depth of the body's centre, metres.
         margin_px: Clear border around the body, pixels.
         depth_noise_m: Standard deviation of the depth noise, metres.
-        keypoint_noise_px: Standard deviation of the keypoints' noise, pixels; of a sample with another focal length, in
+        keypoint_noise_px: Standard deviation of the keypoints' noise, pixels; of a sample with another focal length in
             proportion to it.
-        missing_keypoints: Share of the keypoints that are missing, each by itself; they are filled in from the others.
+        missing_keypoints: Shares of the keypoints, one of which is missing in a sample, each keypoint by itself; those
+            are filled in from the others.
         focal_factors: Range of each sample's focal length in the same image, as multiples of the camera's.
         pixel_factors: Range of each sample's number of pixels along a side, as multiples of the camera's.
         initial_joints: `lifted` (noisy keypoints with the depth at their pixels) or `noised` (true joints with
@@ -56,7 +57,7 @@ class SynthesisSettings:
     margin_px: float = 8.0
     depth_noise_m: float = 0.001
     keypoint_noise_px: float = 10.0
-    missing_keypoints: float = 0.0
+    missing_keypoints: tuple[float, ...] = (0.0,)
     focal_factors: tuple[float, float] = (1.0, 1.0)
     pixel_factors: tuple[float, float] = (1.0, 1.0)
     initial_joints: str = "lifted"
@@ -81,15 +82,17 @@ class SynthesisSettings:
             if not 0 < values[0] <= values[1]:
                 raise ValueError(f"{name}: expected 0 < lowest <= highest, got {values}")
             object.__setattr__(self, name, tuple(map(float, values)))
-        for name in ("margin_px", "depth_noise_m", "keypoint_noise_px", "joint_noise_m", "missing_keypoints"):
+        for name in ("margin_px", "depth_noise_m", "keypoint_noise_px", "joint_noise_m"):
             value = getattr(self, name)
             if not (isinstance(value, int | float) and math.isfinite(value) and value >= 0):
                 raise ValueError(f"{name}: expected a number of 0 or more, got {value!r}")
             object.__setattr__(self, name, float(value))  # so that 10 and 10.0 make the same set of samples
-        if self.missing_keypoints > 1:
+        shares = self.missing_keypoints
+        if not isinstance(shares, Sequence) or not shares or not all(0 <= share <= 1 for share in shares):
             raise ValueError(
-                f"missing_keypoints: expected a share of at most 1, got {self.missing_keypoints}"
+                f"missing_keypoints: expected shares between 0 and 1, as in [0, 0.5], got {shares!r}"
             )
+        object.__setattr__(self, "missing_keypoints", tuple(map(float, shares)))
 
     def smallest(self, camera: Camera) -> Camera:
         """The camera with the smallest image and the narrowest view that a sample may have."""
@@ -262,10 +265,10 @@ class DepthSynthesizer:
         self, keypoints: np.ndarray, epoch: int, index: int
     ) -> tuple[np.ndarray | None, np.ndarray | None]:
         """Keypoints, those that are missing filled in, and confidences; None where none is left."""
-        if self.settings.missing_keypoints == 0:
+        if not any(self.settings.missing_keypoints):
             return keypoints, None
-        draws = self._rng(epoch, index, _MISSING).random(NUM_JOINTS)
-        is_kept = draws >= self.settings.missing_keypoints
+        rng = self._rng(epoch, index, _MISSING)
+        is_kept = rng.random(NUM_JOINTS) >= rng.choice(self.settings.missing_keypoints)
         if not is_kept.any():
             return None, None
         return fill_missing(np.where(is_kept[:, None], keypoints, np.nan)), is_kept.astype(np.float32)

@@ -39,7 +39,8 @@ def initialise(layer: LayerT, slope: float = 0.0, scale: float = 1.0, fan_in: in
     """Kaiming's initialisation: what comes out is as large as what went in, after a (leaky) ReLU of `slope`.
 
     Args:
-        layer: With `weight` `(out, in)`, `(K, out, in)` or `(out, in, kh, kw)`, and `bias`, which becomes zero, or None.
+        layer: With `weight` `(out, in)`, `(K, out, in)` or `(out, in, kh, kw)`, and `bias`, which becomes zero where
+            there is one.
         slope: Of the activation on its negative side: 0.25 for a PReLU, 0 for ReLU and GELU.
         scale: Factor of the weights; a small one for last layers, which then start near their bias.
         fan_in: Input channels, where the layer is a part of one that has more.

@@ -1,18 +1,16 @@
 """`task=cross`: a trained model on data that it was not trained for; rows of the thesis's tables."""
 
-from pathlib import Path
 from typing import Any
 
 from hydra import compose
-from omegaconf import DictConfig, OmegaConf, open_dict
+from omegaconf import DictConfig, OmegaConf
 
 from ljn.building import build
-from ljn.runs import layout
-from ljn.runs.keys import key_of, kind_of
+from ljn.runs.keys import key_of
 from ljn.tasks.arguments import quoted
 from ljn.tasks.evaluate import evaluate_checkpoint
 from ljn.tasks.overrides import apply_overrides, typed_overrides
-from ljn.tasks.train import train
+from ljn.tasks.train import composed, trained
 from ljn.tasks.validation import validate
 
 
@@ -45,9 +43,9 @@ def cross(cfg: DictConfig) -> dict[str, float]:
     validate(changed)
     build(changed.data)
     if task.detector is not None:
-        detector = _trained(_composed(task.detector), task.detector)
+        detector = trained(composed(task.detector), task.detector)
         overrides.append(f"data.detector_ckpt={quoted(detector)}")
-    return evaluate_checkpoint(cfg, _trained(cfg.copy(), task.trains), overrides, cfg.name, reuses=True)
+    return evaluate_checkpoint(cfg, trained(cfg.copy(), task.trains), overrides, cfg.name, reuses=True)
 
 
 def _check_trains(cfg: DictConfig) -> None:
@@ -59,25 +57,10 @@ def _check_trains(cfg: DictConfig) -> None:
     if not typed:
         return
     typed = [line for line in typed if key_of(line).split(".")[0] not in ("experiment", "name", "task")]
-    trained = compose("config", [f"experiment={cfg.task.trains}", *typed])
+    row = compose("config", [f"experiment={cfg.task.trains}", *typed])
     for group in ("model", "module", "data", "trainer"):
-        if trained[group] != cfg[group]:
+        if row[group] != cfg[group]:
             raise ValueError(
                 f"task.trains: '{cfg.task.trains}' has another {group} than this row; choose the row of that "
                 f"experiment, or write one whose defaults begin with it"
             )
-
-
-def _trained(cfg: DictConfig, name: str) -> Path:
-    """The best checkpoint of a configuration, trained here if need be."""
-    with open_dict(cfg):
-        cfg.name = name
-        cfg.rerun = False  # that of the evaluation is meant
-    train(cfg)
-    return Path(cfg.paths.run_dir) / layout.BEST_CHECKPOINT
-
-
-def _composed(experiment: str) -> DictConfig:
-    """The configuration of another experiment with this call's sizes, data, trainer and the like."""
-    shared = [line for line in typed_overrides() if kind_of(key_of(line)).is_shared]
-    return compose("config", [f"experiment={experiment}", *shared])

@@ -4,15 +4,18 @@ import logging
 from pathlib import Path
 
 import torch
-from omegaconf import DictConfig
+from hydra import compose
+from omegaconf import DictConfig, open_dict
 
 from ljn.building import build
 from ljn.data import DataModule
 from ljn.runs import layout
-from ljn.runs.checkpoints import read_checkpoint
+from ljn.runs.checkpoints import Checkpoint, load_state, read_checkpoint
 from ljn.runs.files import read_metrics, write_json
 from ljn.runs.identity import config_hash, identity
+from ljn.runs.keys import Key, key_of, kind_of
 from ljn.runs.record import RunRecord, alone_in, is_complete
+from ljn.tasks.overrides import typed_overrides
 from ljn.tasks.processes import check_trains_in_processes, is_first_process, num_processes
 from ljn.tasks.running import build_trainer, finite_metrics, prepare_process, save_config, set_run_directory
 from ljn.tasks.tracking import tracking
@@ -37,20 +40,64 @@ def train(cfg: DictConfig) -> dict[str, float]:
             "ckpt_path: it is what task=evaluate reads; a training resumes from its own directory by itself"
         )
     validate(cfg)
+    initial = _earlier_stages(cfg)
     datamodule: DataModule = build(cfg.data)
     datamodule.prepare_data()
-    identity_hash = config_hash(identity(cfg, datamodule.fingerprint))
+    begun_with = {} if initial is None else {"begins_with": initial.file_hash}
+    identity_hash = config_hash(identity(cfg, datamodule.fingerprint) | begun_with)
     run_dir = set_run_directory(cfg, "runs", identity_hash)
     with alone_in(run_dir):
         if is_complete(run_dir, identity_hash) and not cfg.rerun:
             _LOG.info("%s is complete; train it again with rerun=true", run_dir)
             return read_metrics(run_dir) or {}
-        return _train(cfg, datamodule, run_dir, identity_hash)
+        return _train(cfg, datamodule, run_dir, identity_hash, initial)
 
 
-def _train(cfg: DictConfig, datamodule: DataModule, run_dir: Path, identity_hash: str) -> dict[str, float]:
+def _earlier_stages(cfg: DictConfig) -> Checkpoint | None:
+    """Train, or find trained, what this training builds upon.
+
+    Names the detector's checkpoint in the data's settings; returns the checkpoint that the weights begin with, if any.
+    """
+    detector, begins_with = cfg.task.get("detector"), cfg.task.get("begins_with")
+    if detector is not None:
+        path = trained(composed(detector), detector)
+        with open_dict(cfg):
+            cfg.data.detector_ckpt = str(path)
+    if begins_with is None:
+        return None
+    return read_checkpoint(trained(composed(begins_with, is_same_stage=True), begins_with))
+
+
+def trained(cfg: DictConfig, name: str) -> Path:
+    """The best checkpoint of a configuration, trained here if need be."""
+    with open_dict(cfg):
+        cfg.name = name
+        cfg.rerun = False  # that of the evaluation is meant
+    train(cfg)
+    return Path(cfg.paths.run_dir) / layout.BEST_CHECKPOINT
+
+
+def composed(experiment: str, is_same_stage: bool = False) -> DictConfig:
+    """The configuration of another experiment with this call's sizes, data, trainer and the like.
+
+    Of the same stage, with all that is not the task's.
+    """
+    lines = [(line, kind_of(key_of(line))) for line in typed_overrides()]
+    shared = [
+        line
+        for line, kind in lines
+        if kind.is_shared or (is_same_stage and not kind & Key.TASK and key_of(line) != "experiment")
+    ]
+    return compose("config", [f"experiment={experiment}", *shared])
+
+
+def _train(
+    cfg: DictConfig, datamodule: DataModule, run_dir: Path, identity_hash: str, initial: Checkpoint | None
+) -> dict[str, float]:
     prepare_process(cfg)
     module = build(cfg.module)
+    if initial is not None:
+        load_state(module, initial, "task.begins_with")
     datamodule.takes = module.takes
     check_trains_in_processes(module, num_processes(cfg.trainer))
     last, best = run_dir / layout.LAST_CHECKPOINT, run_dir / layout.BEST_CHECKPOINT
@@ -63,6 +110,7 @@ def _train(cfg: DictConfig, datamodule: DataModule, run_dir: Path, identity_hash
         "name": cfg.name,
         "preset": cfg.preset.name,
         "config_hash": identity_hash,
+        "begins_with": None if initial is None else {"path": str(initial.path), "hash": initial.file_hash},
         "data": datamodule.describe(),
         **module.describe(),
         "predicted_body": "-".join(module.body_hashes) or None,

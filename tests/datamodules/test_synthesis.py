@@ -298,13 +298,13 @@ def test_poses_without_a_heading_of_their_own_cannot_keep_it(make):
 
 def test_missing_keypoints_are_filled_in_and_have_no_confidence(make, batch):
     takes = ("crop", "crop_camera", "confidences")
-    some = make(takes=takes, missing_keypoints=0.5).batch(KEYS)
+    some = make(takes=takes, missing_keypoints=(0.5,)).batch(KEYS)
     is_kept = some["confidences"] > 0
     assert 0.4 < is_kept.float().mean() < 0.6
     assert torch.equal(some["keypoints"][is_kept], batch["keypoints"][is_kept])
     moved = (some["keypoints"] - batch["keypoints"]).norm(dim=-1)[~is_kept]
     assert 1 < moved.median() < 40  # a guess, but a near one
-    none = make(takes=takes, missing_keypoints=1).batch(KEYS)
+    none = make(takes=takes, missing_keypoints=(1,)).batch(KEYS)
     assert not none["confidences"].any()
     assert (none["keypoints"] == none["keypoints"][:, :1]).all()
     assert torch.equal(make(takes=takes).batch(KEYS)["confidences"], torch.ones(12, 24))
@@ -350,7 +350,7 @@ def test_a_sample_of_another_camera_is_seen_by_that_camera(make, kinect):
         (SynthesisSettings, {"renderer": "opengl"}, "renderer: expected one of auto, zbuffer, torch, .*got 'opengl'"),
         (SynthesisSettings, {"distance_m": (3.0, 2.0)}, "distance_m: expected 0 < lowest <= highest"),
         (SynthesisSettings, {"pixel_factors": 0.5}, "pixel_factors: expected two numbers"),
-        (SynthesisSettings, {"missing_keypoints": 2}, "missing_keypoints: expected a share of at most 1"),
+        (SynthesisSettings, {"missing_keypoints": (0, 2)}, "missing_keypoints: expected shares between 0 and 1"),
         (SynthesisSettings, {"margin_px": -1.0}, "margin_px: expected a number of 0 or more, got -1"),
         (SynthesisSettings, {"keypoint_noise_px": -5.0}, "keypoint_noise_px: expected a number of 0 or more"),
     ],

@@ -117,7 +117,7 @@ def test_what_goes_into_records_has_the_motion_capture_of_each_split_that_is_rea
 # Another value of every field of the settings objects; a new field fails the test until it stands here.
 OTHER = {
     "heading": "uniform", "distance_m": (1.5, 2.5), "margin_px": 9.0, "depth_noise_m": 0.002, "keypoint_noise_px": 5.0,
-    "missing_keypoints": 0.5, "focal_factors": (0.9, 1.1), "pixel_factors": (0.9, 1.1),
+    "missing_keypoints": (0, 0.5), "focal_factors": (0.9, 1.1), "pixel_factors": (0.9, 1.1),
     "initial_joints": "noised", "joint_noise_m": 0.01, "joint_noise": "isotropic", "renderer": "zbuffer",
     "num_points": 33, "normals": "knn", "crop_px": 64, "spacing_m": 0.01,
     "fx": 360.0, "fy": 360.0, "cx": 200.0, "cy": 250.0, "width": 420, "height": 500,

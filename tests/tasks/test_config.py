@@ -164,8 +164,8 @@ def test_what_types_cannot_say_is_validated(overrides, message, compose_config, 
 @pytest.mark.parametrize(
     ("override", "message"),
     [
-        ("data.synthesis.distance_m=2", "distance_m: expected two numbers, nearest and farthest, got 2"),
-        ("data.synthesis.distance_m=[3,1]", "distance_m: expected 0 < nearest <= farthest"),
+        ("data.synthesis.distance_m=2", "distance_m: expected two numbers, lowest and highest, got 2"),
+        ("data.synthesis.distance_m=[3,1]", "distance_m: expected 0 < lowest <= highest"),
         ("data.synthesis.depth_noise_m=nan", "depth_noise_m: expected a number of 0 or more, got nan"),
         ("data.synthesis.margin_px=300", "margin_px: a clear border of 300"),
         ("data.synthesis.heading=sideways", "heading: expected one of source, histogram, uniform, got 'sideways'"),

@@ -2,9 +2,11 @@ import json
 from pathlib import Path
 
 import pytest
+import torch
 from hydra import initialize_config_dir
 
-from ljn.tasks.cross import _composed, cross
+from ljn.tasks.cross import cross
+from ljn.tasks.train import composed, train
 
 CONF = Path(__file__).parents[2] / "conf"
 
@@ -53,9 +55,9 @@ def test_the_detector_of_a_chain_has_the_calls_sizes_and_machine_and_nothing_of_
         "data.synthesis.joint_noise_m=0.5", "optimized_metric=val/apve", "callbacks.best.mode=max",
         "callbacks.pictures=null", "num_threads=1",
     )  # fmt: skip
-    monkeypatch.setattr("ljn.tasks.cross.typed_overrides", lambda: list(typed))
+    monkeypatch.setattr("ljn.tasks.train.typed_overrides", lambda: list(typed))
     with initialize_config_dir(str(CONF), version_base="1.3"):
-        cfg = _composed("detector/proposed")
+        cfg = composed("detector/proposed")
     assert (cfg.seed, cfg.data.num_train, cfg.body.genders, cfg.tags) == (3, 8, ["male"], ["a"])
     assert (cfg.data.observation.num_points, cfg.data.num_workers, cfg.trainer.precision) == (64, 0, 64)
     assert (cfg.paths.output_dir, cfg.callbacks.pictures, cfg.num_threads) == ("a=b", None, 1)
@@ -77,3 +79,26 @@ def test_a_mistake_in_the_changes_is_an_error_before_the_training(smoke_config, 
     with pytest.raises(ValueError, match=message):
         cross(cfg)
     assert not (tmp_path / "runs").exists()
+
+
+def test_a_training_begins_with_another_s_weights_and_takes_a_detector_s_joints(
+    smoke_config, monkeypatch, tmp_path
+):
+    shared = ["preset=smoke", "logger=csv", "callbacks.pictures=null", f"paths.output_dir={tmp_path}"]
+    shared += ["data.num_workers=0", "preset.num_train=8", "preset.num_test=8", "preset.num_val=8"]
+    experiment = "experiment=mesh/kinematic_on_cascade"
+    # So slow that nothing is learned.
+    cfg = smoke_config(tmp_path, experiment, *shared, "preset.max_epochs=1", "module.optimizer.lr=1e-12")
+    monkeypatch.setattr("ljn.tasks.train.typed_overrides", lambda: [experiment, *shared])
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        train(cfg)
+    runs = {path.name.rpartition("-smoke-")[0]: path for path in (tmp_path / "runs").iterdir()}
+    assert set(runs) == {"detector-cascade", "mesh-kinematic", "mesh-kinematic_on_cascade"}
+    record = json.loads((runs["mesh-kinematic_on_cascade"] / "record.json").read_text())
+    first, second = (
+        torch.load(runs[name] / "checkpoints" / "best.ckpt", weights_only=True)["state_dict"]
+        for name in ("mesh-kinematic", "mesh-kinematic_on_cascade")
+    )
+    torch.testing.assert_close(first, second, atol=1e-6, rtol=0)
+    assert record["begins_with"]["path"] == str(runs["mesh-kinematic"] / "checkpoints" / "best.ckpt")
+    assert record["data"]["detector"]["path"] == str(runs["detector-cascade"] / "checkpoints" / "best.ckpt")
