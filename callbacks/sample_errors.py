@@ -1,5 +1,6 @@
 """Every test sample on disk: its metrics, for paired tests and worst cases, its truth and its prediction."""
 
+import csv
 from pathlib import Path
 from typing import Any
 
@@ -8,6 +9,7 @@ from lightning.pytorch import Callback, Trainer
 from torch import Tensor
 
 from callbacks.gathering import gather_samples
+from ljn.data import DataModule
 from ljn.modules.base import StageModule
 from ljn.runs import layout
 
@@ -19,6 +21,9 @@ class SampleErrors(Callback):
     under the metric's key, and what the module says is stored beside them (`truth` and `stored` of `StageModule`): of
     both stages, `joints`, `pred_joints` and `initial_joints` `(S, 24, 3)` in metres, camera frame; of a mesh regressor
     also `pred_pose` `(S, 72)` and `pred_betas` `(S, 10)`.
+
+    Beside it, `test_groups.csv` has the number of samples and the mean of every metric of each kind of sample that the
+    data tells apart (`DataModule.groups`), worst first.
     """
 
     def __init__(self, directory: str | Path) -> None:
@@ -40,4 +45,38 @@ class SampleErrors(Callback):
         if not arrays or not trainer.is_global_zero:
             return
         self.path.parent.mkdir(parents=True, exist_ok=True)
-        np.savez_compressed(self.path, **{name: value.numpy() for name, value in arrays.items()})  # type: ignore[arg-type]
+        values = {name: value.numpy() for name, value in arrays.items()}
+        np.savez_compressed(self.path, **values)  # type: ignore[arg-type]
+        data: DataModule = trainer.datamodule  # type: ignore[attr-defined]
+        lines = group_lines(
+            values, data.groups("test"), list(pl_module.metrics.table), pl_module.metrics.headline[0]
+        )
+        if lines:
+            with self.path.with_name(layout.GROUPS).open("w", newline="") as file:
+                csv.writer(file).writerows(lines)
+
+
+def group_lines(
+    values: dict[str, np.ndarray], groups: dict[str, np.ndarray], metrics: list[str], order: str
+) -> list[list[Any]]:
+    """A table with a header: of each kind of sample the number, and the mean of each metric; by `order`, highest first.
+
+    Args:
+        values: `sample_id` `(S,)` and each metric's values `(S,)`.
+        groups: See `DataModule.groups`.
+        metrics: The metrics' keys.
+        order: One of them.
+    """
+    if not groups:
+        return []
+    lines: list[list[Any]] = [["by", "kind", "samples", *metrics]]
+    for by, names in groups.items():
+        kinds = names[values["sample_id"]]
+        rows = []
+        for kind in np.unique(kinds):
+            chosen = kinds == kind
+            means = {name: float(values[name][chosen].mean()) for name in metrics}
+            row = [by, str(kind), int(chosen.sum()), *(round(mean, 3) for mean in means.values())]
+            rows.append((means[order], row))
+        lines += [row for _, row in sorted(rows, key=lambda pair: -pair[0])]
+    return lines

@@ -2,12 +2,14 @@
 
 import hashlib
 import logging
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, cast
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.utils.data import BatchSampler, DataLoader, Dataset
@@ -22,6 +24,7 @@ from ljn.cloud.normals import get_normal_estimator
 from ljn.cloud.observation import ObservationRecipe
 from ljn.data import SPLITS, Batch, DataModule
 from ljn.geometry.camera import Camera
+from ljn.geometry.rotations import rotvec_to_rotmat
 from ljn.modules.joint_detector import JointDetector
 from ljn.render import get_renderer
 from ljn.runs.checkpoints import Checkpoint, load_module
@@ -103,7 +106,7 @@ class SyntheticDepthDataModule(DataModule):
         self._bodies: tuple[BodyModel, ...] | None = None
         self._records: dict[str, PoseRecords] = {}
         self._train: DepthSynthesizer | None = None
-        self._fixed: dict[str, Dataset] = {}
+        self._fixed: dict[str, FixedSamples] = {}
 
     @property
     def bodies(self) -> tuple[BodyModel, ...]:
@@ -147,6 +150,16 @@ class SyntheticDepthDataModule(DataModule):
             )
         batch, depth = self._synthesizer(split).examples([(0, index) for index in indices])
         return self.on_after_batch_transfer(batch, 0), depth
+
+    def groups(self, split: str) -> dict[str, np.ndarray]:
+        """See `DataModule`: by `pose` (see `PoseRecords.kinds`) and by `heading` (facing, sideways or away)."""
+        records = self._records_of(split)
+        poses = self._fixed[split].samples["pose"][:, :3]
+        # SMPL's front in the body world, whose x points at the camera.
+        towards = rotvec_to_rotmat(poses)[:, 0, 2].numpy()
+        bound = math.sqrt(0.5)
+        headings = np.select([towards > bound, towards < -bound], ["facing", "away"], "sideways")
+        return {"pose": records.kinds, "heading": headings}
 
     def describe(self, splits: Sequence[str] = SPLITS) -> dict[str, Any]:
         """See `DataModule`."""

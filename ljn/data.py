@@ -4,6 +4,7 @@ from abc import abstractmethod
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, TypedDict
 
+import numpy as np
 from lightning.pytorch import LightningDataModule
 from torch import Tensor
 
@@ -87,6 +88,12 @@ class DataModule(LightningDataModule):
         Raises:
             ValueError: The split has no such sample.
         """
+
+    def groups(self, split: str) -> dict[str, np.ndarray]:
+        """Kinds of samples, in whose errors one may be interested: for each way to divide a split, `(S,)` str, the name
+        of each sample's kind, in the order of their numbers.
+        """
+        return {}
 
     @abstractmethod
     def describe(self, splits: Sequence[str] = SPLITS) -> dict[str, Any]:

@@ -55,6 +55,19 @@ class PoseRecords:
     def __len__(self) -> int:
         return len(self.pose)
 
+    @property
+    def kinds(self) -> np.ndarray:
+        """`(R,)` str: of a procedural pose its family, else `clip` or, of parts from several donors, `recombined`."""
+        kinds = [
+            name.removeprefix("proc/")
+            if name.startswith("proc/")
+            else "recombined"
+            if "|" in name
+            else "clip"
+            for name in self.sequence.tolist()
+        ]
+        return np.array(kinds, dtype=str)
+
     @cached_property
     def hash(self) -> str:
         """Name of the table's content: the first 16 hex digits of a SHA-256 over all columns, row by row.

@@ -6,7 +6,7 @@ sample, in PCKh too, where a comparison with NaN would count as an ordinary miss
 
 from torch import Tensor
 
-from ljn.body.skeleton import HEAD_BONE, NUM_JOINTS, ROOT
+from ljn.body.skeleton import HEAD_BONE, MIRROR, NUM_JOINTS, ROOT
 from ljn.geometry.alignment import procrustes_align, root_align
 
 MM_PER_METRE = 1000.0
@@ -120,6 +120,20 @@ def pckh_root_aligned(pred: Tensor, target: Tensor) -> Tensor:
         `(...)`, %, float64.
     """
     return pckh(root_align(pred.double(), ROOT), root_align(target.double(), ROOT))
+
+
+def exchanged(pred: Tensor, target: Tensor) -> Tensor:
+    """Return whether the prediction fits better with left and right exchanged: a body seen from the wrong side.
+
+    Args:
+        pred: `(..., 24, 3)`, metres.
+        target: `(..., 24, 3)`, metres, the same frame.
+
+    Returns:
+        `(...)`, 100 or 0 (%), float64.
+    """
+    errors, others = mpjpe(pred, target), mpjpe(pred[..., list(MIRROR), :], target)
+    return (100.0 * (others < errors)).to(errors.dtype).where(~errors.isnan(), errors)
 
 
 def apve(pred: Tensor, target: Tensor) -> Tensor:

@@ -24,6 +24,7 @@ class JointMetrics(StageMetrics):
         "mpjpe_procrustes": Quantity(functional.mpjpe_procrustes, _PREDICTED),
         "pckh": Quantity(functional.pckh, _PREDICTED, "%", "max"),
         "pckh_root_aligned": Quantity(functional.pckh_root_aligned, _PREDICTED, "%", "max"),
+        "exchanged": Quantity(functional.exchanged, _PREDICTED, "%"),
         "pckh_threshold_mm": Quantity(functional.pckh_threshold_mm, ("joints",), goal=None),
         "initial_mpjpe": Quantity(functional.mpjpe, ("initial_joints", "joints")),
         "initial_mean_distance_px": Quantity(functional.keypoint_distances_px, _KEYPOINTS, "px", None),

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from ljn.body.skeleton import HEAD_BONE, NUM_JOINTS, ROOT
+from ljn.body.skeleton import HEAD_BONE, MIRROR, NUM_JOINTS, ROOT
 from ljn.metrics import functional
 
 NAMES = ("mpjpe", "mpjpe_eq38", "mpjpe_root_aligned", "mpjpe_procrustes", "pckh")
@@ -19,6 +19,15 @@ def joints_pair(seed=0):
     neck, head = HEAD_BONE
     target[:, head] = target[:, neck] + torch.tensor([0.02, -0.09, 0.03])
     return target + 0.03 * torch.randn(target.shape, generator=generator), target
+
+
+def test_a_body_with_its_sides_exchanged_is_one_and_a_noisy_one_is_not():
+    pred, target = joints_pair()
+    wrong = pred.clone()
+    wrong[:2] = pred[:2][:, list(MIRROR)]
+    wrong[2, 0] = torch.nan
+    expected = torch.tensor([100.0, 100, torch.nan, 0, 0, 0], dtype=torch.float64)
+    torch.testing.assert_close(functional.exchanged(wrong, target), expected, equal_nan=True)
 
 
 def distance(a, b):

@@ -8,7 +8,15 @@ from torch import distributed
 
 from ljn.metrics import JointMetrics, MeshMetrics, SampleMax, functional
 
-SCORES = {"mpjpe", "mpjpe_eq38", "mpjpe_root_aligned", "mpjpe_procrustes", "pckh", "pckh_root_aligned"}
+SCORES = {
+    "mpjpe",
+    "mpjpe_eq38",
+    "mpjpe_root_aligned",
+    "mpjpe_procrustes",
+    "pckh",
+    "pckh_root_aligned",
+    "exchanged",
+}
 KEYS = SCORES | {"pckh_threshold_mm", "initial_mpjpe", "initial_mean_distance_px", "initial_max_distance_px"}
 NUM_SAMPLES = 13
 

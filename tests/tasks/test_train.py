@@ -57,6 +57,18 @@ def test_a_run_leaves_its_files(trained):
     assert rows[-1]["test/mpjpe"]
 
 
+def test_the_errors_of_kinds_of_samples_add_up_to_the_whole(trained):
+    metrics, run_dir = trained
+    with (run_dir / "test_groups.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    for by in ("pose", "heading"):
+        kinds = [row for row in rows if row["by"] == by]
+        total = sum(int(row["samples"]) * float(row["mpjpe"]) for row in kinds)
+        assert sum(int(row["samples"]) for row in kinds) == 16
+        assert total / 16 == pytest.approx(metrics["test/mpjpe"], abs=1e-2)
+    assert {row["kind"] for row in rows if row["by"] == "heading"} <= {"facing", "sideways", "away"}
+
+
 def test_stored_samples_give_the_metrics_again(trained):
     metrics, run_dir = trained
     with np.load(run_dir / "test_errors.npz") as arrays:
