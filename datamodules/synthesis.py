@@ -17,7 +17,7 @@ from ljn.body import SMPL, BodyModel
 from ljn.cloud.observation import ObservationRecipe, observe, stack_observations
 from ljn.data import Batch
 from ljn.geometry.camera import Camera, project
-from ljn.geometry.rotations import CAMERA_FROM_BODY, rotation_about, rotmat_to_rotvec, rotvec_to_rotmat
+from ljn.geometry.rotations import body_to_camera, rotation_about, rotmat_to_rotvec, rotvec_to_rotmat
 from ljn.render import RENDERERS, Renderer, get_renderer
 
 # Each purpose has a generator of its own: changing one (the number of points, a sigma) leaves the others' draws.
@@ -91,6 +91,7 @@ class DepthSynthesizer:
         settings: See `SynthesisSettings`.
         recipe: How depth images are observed.
         takes: What of an observation is made beside keypoints and initial joints: see `ljn.cloud.observation.PARTS`.
+            Where none of it comes from a depth image, none is rendered.
         seed_key: What the random draws depend on, beside a sample's epoch and index: a seed and a split number.
         dtype: Precision of the body; float64 makes fixed sets agree across machines.
     """
@@ -140,16 +141,28 @@ class DepthSynthesizer:
 
         A sample depends on its key alone; in float32 up to the rounding of products over a batch.
         """
-        return self._observe(keys, self._render(keys))
+        return self._observe(keys, self._scene(keys, self._takes_image))
 
     def examples(self, keys: Sequence[tuple[int, int]]) -> tuple[Batch, Tensor]:
         """The samples of `keys` with the noisy depth images `(B, H, W)`, metres, that they were taken from."""
-        scene = self._render(keys)
+        scene = self._scene(keys, with_depth=True)
         return self._observe(keys, scene), torch.from_numpy(scene.depth)
 
+    @property
+    def _seen(self) -> frozenset[str]:
+        """What is made by `observe`; joints with noise are not."""
+        return frozenset(
+            self.takes - ({"initial_joints"} if self.settings.initial_joints == "noised" else set())
+        )
+
+    @property
+    def _takes_image(self) -> bool:
+        """Whether anything that is taken comes from a depth image."""
+        return self._seen != {"keypoints"}
+
     @torch.no_grad()
-    def _render(self, keys: Sequence[tuple[int, int]]) -> "_Scene":
-        """Pose the bodies, place them before the camera, take noisy depth images."""
+    def _scene(self, keys: Sequence[tuple[int, int]], with_depth: bool) -> "_Scene":
+        """Pose the bodies, place them before the camera, take noisy depth images where these are wanted."""
         settings, camera = self.settings, self.camera
         placement = [self._rng(epoch, index, _PLACEMENT) for epoch, index in keys]
         rows = [index for _, index in keys]
@@ -161,8 +174,7 @@ class DepthSynthesizer:
 
         gender = torch.from_numpy(self.records.gender[rows])
         vertices, joints = self._smpl(pose, betas, gender)
-        cam_from_body = CAMERA_FROM_BODY.to(self.dtype)
-        vertices, joints = vertices @ cam_from_body.T, joints @ cam_from_body.T
+        vertices, joints = body_to_camera(vertices), body_to_camera(joints)
         transl = torch.from_numpy(
             np.stack(
                 [
@@ -171,9 +183,10 @@ class DepthSynthesizer:
                 ]
             )
         ).to(self.dtype)
-        vertices, joints = vertices + transl[:, None], joints + transl[:, None]
-
-        depth = self._renderer(vertices, self._smpl.faces, camera).numpy()
+        joints = joints + transl[:, None]
+        if not with_depth:
+            return _Scene(pose, betas, gender, joints, np.zeros((len(keys), 0, 0), np.float32))
+        depth = self._renderer(vertices + transl[:, None], self._smpl.faces, camera).numpy()
         for image, (epoch, index) in zip(depth, keys):
             add_depth_noise(
                 image, settings.depth_noise_m, self._rng(epoch, index, _DEPTH_NOISE), in_place=True
@@ -191,7 +204,7 @@ class DepthSynthesizer:
                 keypoints[i].numpy(), settings.keypoint_noise_px, self._rng(epoch, index, _KEYPOINTS)
             )
             sampling = self._rng(epoch, index, _SAMPLING)
-            made = observe(scene.depth[i], camera, noisy, self.recipe, self.takes, sampling)
+            made = observe(scene.depth[i], camera, noisy, self.recipe, self._seen, sampling)
             if settings.initial_joints == "noised":
                 made["initial_joints"] = add_joint_noise(
                     scene.joints[i].numpy(),
@@ -213,7 +226,10 @@ class DepthSynthesizer:
 
 
 class _Scene(NamedTuple):
-    """Bodies before the camera: `(B, 72)`, `(B, 10)`, `(B,)`, `(B, 24, 3)` and noisy depth `(B, H, W)`, metres."""
+    """Bodies before the camera: `(B, 72)`, `(B, 10)`, `(B,)`, `(B, 24, 3)` and noisy depth `(B, H, W)`, metres.
+
+    Depth is `(B, 0, 0)` where nothing of it is taken.
+    """
 
     pose: Tensor
     betas: Tensor

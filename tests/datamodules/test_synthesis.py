@@ -157,6 +157,20 @@ def test_the_depth_noise_leaves_keypoints_places_and_the_choice_of_pixels(make, 
     assert float(noise.std()) == pytest.approx(0.001, rel=0.1)
 
 
+def test_joints_with_noise_need_no_image_and_are_the_same_as_with_one(make):
+    seen = make(initial_joints="noised").batch(KEYS)
+    blind = make(initial_joints="noised", takes=())
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(blind.__dict__, "_renderer", None)
+        unseen = blind.batch(KEYS)
+    assert set(unseen) == set(seen) - {"points"}
+    assert all(torch.equal(unseen[name], seen[name]) for name in unseen)
+    assert not torch.equal(unseen["initial_joints"], unseen["joints"])
+    examples, depth = blind.examples(KEYS[:2])  # these show what is not taken
+    assert (depth > 0).flatten(1).any(1).all()
+    torch.testing.assert_close(examples["initial_joints"], unseen["initial_joints"][:2], atol=1e-5, rtol=0)
+
+
 def test_a_synthesizer_survives_its_way_to_another_process(make, batch):
     synthesizer = make()
     synthesizer.batch(KEYS[:1])
