@@ -4,7 +4,7 @@ import math
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple, cast
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -12,6 +12,7 @@ from torch import Tensor
 
 from datamodules.noise import JOINT_NOISES, add_depth_noise, add_joint_noise, add_keypoint_noise
 from datamodules.placement import HEADINGS, check_margin, draw_heading, place
+from datamodules.scenes import KeptScenes, Scene, mirrored
 from datamodules.sources import PoseRecords
 from ljn.body import SMPL, BodyModel
 from ljn.cloud.observation import ObservationRecipe, observe, stack_observations
@@ -23,9 +24,17 @@ from ljn.render import RENDERERS, Renderer, get_renderer
 # Each purpose has a generator of its own: changing one (the number of points, a sigma) leaves the others' draws.
 _PLACEMENT, _DEPTH_NOISE, _SAMPLING, _KEYPOINTS, _JOINTS = range(5)
 
+SampleKey = tuple[int, ...]
+"""An epoch, a record's index and, where a render is used again, the number of that use; without it, the first, 0."""
+
 SAMPLES_VERSION = 1
 """Raised with every change of the samples made of the same records: results are comparable within a version only."""
 INITIAL_JOINTS = ("lifted", "noised")
+
+
+def is_mirrored(key: SampleKey) -> bool:
+    """Whether a sample shows its render mirrored: every second use does."""
+    return sum(key[2:]) % 2 == 1
 
 
 @dataclass(frozen=True)
@@ -94,6 +103,7 @@ class DepthSynthesizer:
             Where none of it comes from a depth image, none is rendered.
         seed_key: What the random draws depend on, beside a sample's epoch and index: a seed and a split number.
         dtype: Precision of the body; float64 makes fixed sets agree across machines.
+        num_kept: How many batches' renders are kept, for batches of the same bodies to come.
     """
 
     def __init__(
@@ -106,6 +116,7 @@ class DepthSynthesizer:
         takes: Collection[str],
         seed_key: tuple[int, int],
         dtype: torch.dtype = torch.float32,
+        num_kept: int = 0,
     ) -> None:
         if settings.heading == "source" and not records.has_heading:
             raise ValueError(
@@ -120,9 +131,10 @@ class DepthSynthesizer:
         self.takes = {*takes, "keypoints", "initial_joints"}
         self.seed_key = seed_key
         self.dtype = dtype
+        self.num_kept = num_kept
 
     def __getstate__(self) -> dict[str, Any]:
-        lazy = ("_smpl", "_renderer")
+        lazy = ("_smpl", "_renderer", "_kept")
         return {name: value for name, value in self.__dict__.items() if name not in lazy}
 
     @cached_property
@@ -133,19 +145,29 @@ class DepthSynthesizer:
     def _renderer(self) -> Renderer:
         return get_renderer(self.settings.renderer)
 
-    def _rng(self, epoch: int, index: int, purpose: int) -> np.random.Generator:
-        return np.random.default_rng([*self.seed_key, epoch, index, purpose])
+    @cached_property
+    def _kept(self) -> KeptScenes:
+        return KeptScenes(self.num_kept)
 
-    def batch(self, keys: Sequence[tuple[int, int]]) -> Batch:
-        """The samples of `keys`, each an epoch and a record's index.
+    def _rng(self, key: SampleKey, purpose: int) -> np.random.Generator:
+        epoch, index, *use = key
+        return np.random.default_rng([*self.seed_key, epoch, index, purpose, *(use if any(use) else ())])
+
+    def batch(self, keys: Sequence[SampleKey]) -> Batch:
+        """The samples of `keys`.
 
         A sample depends on its key alone; in float32 up to the rounding of products over a batch.
         """
-        return self._observe(keys, self._scene(keys, self._takes_image))
+        rendered = tuple(key[:2] for key in keys)
+        scene = self._kept.get(rendered)
+        if scene is None:
+            scene = self._render(rendered, self._takes_image)
+            self._kept.put(rendered, scene)
+        return self._observe(keys, self._in_use(keys, scene))
 
-    def examples(self, keys: Sequence[tuple[int, int]]) -> tuple[Batch, Tensor]:
+    def examples(self, keys: Sequence[SampleKey]) -> tuple[Batch, Tensor]:
         """The samples of `keys` with the noisy depth images `(B, H, W)`, metres, that they were taken from."""
-        scene = self._scene(keys, with_depth=True)
+        scene = self._in_use(keys, self._render([key[:2] for key in keys], with_depth=True))
         return self._observe(keys, scene), torch.from_numpy(scene.depth)
 
     @property
@@ -161,10 +183,10 @@ class DepthSynthesizer:
         return self._seen != {"keypoints"}
 
     @torch.no_grad()
-    def _scene(self, keys: Sequence[tuple[int, int]], with_depth: bool) -> "_Scene":
-        """Pose the bodies, place them before the camera, take noisy depth images where these are wanted."""
+    def _render(self, keys: Sequence[SampleKey], with_depth: bool) -> Scene:
+        """Pose the bodies, place them before the camera, render them where depth is wanted."""
         settings, camera = self.settings, self.camera
-        placement = [self._rng(epoch, index, _PLACEMENT) for epoch, index in keys]
+        placement = [self._rng(key, _PLACEMENT) for key in keys]
         rows = [index for _, index in keys]
         pose = torch.from_numpy(self.records.pose[rows]).to(self.dtype)
         heading = torch.tensor([draw_heading(settings.heading, rng) for rng in placement], dtype=self.dtype)
@@ -184,33 +206,37 @@ class DepthSynthesizer:
             )
         ).to(self.dtype)
         joints = joints + transl[:, None]
-        if not with_depth:
-            return _Scene(pose, betas, gender, joints, np.zeros((len(keys), 0, 0), np.float32))
-        depth = self._renderer(vertices + transl[:, None], self._smpl.faces, camera).numpy()
-        for image, (epoch, index) in zip(depth, keys):
-            add_depth_noise(
-                image, settings.depth_noise_m, self._rng(epoch, index, _DEPTH_NOISE), in_place=True
-            )
-        return _Scene(pose, betas, gender, joints, depth)
+        if with_depth:
+            depth = self._renderer(vertices + transl[:, None], self._smpl.faces, camera).numpy()
+        else:
+            depth = np.zeros((len(keys), 0, 0), np.float32)
+        return Scene(pose, betas, gender, joints, [camera] * len(keys), depth)
 
-    def _observe(self, keys: Sequence[tuple[int, int]], scene: "_Scene") -> Batch:
+    def _in_use(self, keys: Sequence[SampleKey], scene: Scene) -> Scene:
+        """A rendered scene as the use that each key names sees it: mirrored or not, with depth noise of its own."""
+        scene = mirrored(scene, [is_mirrored(key) for key in keys])
+        for image, key in zip(scene.depth, keys):
+            add_depth_noise(image, self.settings.depth_noise_m, self._rng(key, _DEPTH_NOISE), in_place=True)
+        return scene
+
+    def _observe(self, keys: Sequence[SampleKey], scene: Scene) -> Batch:
         """Observe the depth images; add the truth."""
-        settings, camera = self.settings, self.camera
-        intrinsics = camera.intrinsics(self.dtype).expand(len(keys), 4)
+        settings = self.settings
+        intrinsics = torch.stack([camera.intrinsics(self.dtype) for camera in scene.cameras])
         keypoints = project(scene.joints, intrinsics).float()
         observations = []
-        for i, (epoch, index) in enumerate(keys):
+        for i, (key, camera) in enumerate(zip(keys, scene.cameras)):
             noisy = add_keypoint_noise(
-                keypoints[i].numpy(), settings.keypoint_noise_px, self._rng(epoch, index, _KEYPOINTS)
+                keypoints[i].numpy(), settings.keypoint_noise_px, self._rng(key, _KEYPOINTS)
             )
-            sampling = self._rng(epoch, index, _SAMPLING)
+            sampling = self._rng(key, _SAMPLING)
             made = observe(scene.depth[i], camera, noisy, self.recipe, self._seen, sampling)
             if settings.initial_joints == "noised":
                 made["initial_joints"] = add_joint_noise(
                     scene.joints[i].numpy(),
                     settings.joint_noise_m,
                     settings.joint_noise,
-                    self._rng(epoch, index, _JOINTS),
+                    self._rng(key, _JOINTS),
                 )
             observations.append(made)
         return Batch(
@@ -221,21 +247,8 @@ class DepthSynthesizer:
             betas=scene.betas.float(),
             gender=scene.gender,
             camera=intrinsics.float(),
-            sample_id=torch.tensor([index for _, index in keys]),
+            sample_id=torch.tensor([index for _, index, *_ in keys]),
         )
-
-
-class _Scene(NamedTuple):
-    """Bodies before the camera: `(B, 72)`, `(B, 10)`, `(B,)`, `(B, 24, 3)` and noisy depth `(B, H, W)`, metres.
-
-    Depth is `(B, 0, 0)` where nothing of it is taken.
-    """
-
-    pose: Tensor
-    betas: Tensor
-    gender: Tensor
-    joints: Tensor
-    depth: np.ndarray
 
 
 def concatenate(batches: Iterable[Batch], num_samples: int) -> dict[str, Tensor]:
