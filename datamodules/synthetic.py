@@ -21,7 +21,7 @@ from datamodules.batches import (
     check_workers,
     fixed_batches,
 )
-from datamodules.cache import cached_samples
+from datamodules.cache import cached_records, cached_samples
 from datamodules.placement import check_margin
 from datamodules.sources import PoseRecords, PoseSource
 from datamodules.synthesis import SAMPLES_VERSION, DepthSynthesizer, SampleKey, SynthesisSettings, concatenate
@@ -57,7 +57,7 @@ class SyntheticDepthDataModule(DataModule):
         seed: Seed of the training samples' draws and order.
         pool_seed: Seed of the poses and shapes.
         eval_seed: Seed of the validation and test samples' draws.
-        cache_dir: Where the fixed sets are kept.
+        cache_dir: Where the fixed sets and the poses are kept.
         body_path: SMPL-format file, or a folder of them; the embedded bodies by default. See
             `load_body_models`.
         detector_ckpt: Checkpoint of a joint detector, whose joints then stand in place of the initial ones; it runs
@@ -229,7 +229,15 @@ class SyntheticDepthDataModule(DataModule):
 
     def _records_of(self, split: str) -> PoseRecords:
         if split not in self._records:
-            self._records[split] = self.source.records(split, self.sizes[split], self.pool_seed)
+            source, size = self.source, self.sizes[split]
+
+            def make() -> PoseRecords:
+                _LOG.info("making %d %s poses", size, split)
+                return source.records(split, size, self.pool_seed)
+
+            made_of = f"{source.name} {source.version} {source.fingerprint} {split} {size} {self.pool_seed}"
+            key = f"{split}-poses-{hashlib.sha256(made_of.encode()).hexdigest()[:16]}"
+            self._records[split] = cached_records(self.cache_dir, key, make)
         return self._records[split]
 
     def _synthesizer(self, split: str) -> DepthSynthesizer:

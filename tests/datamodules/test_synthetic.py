@@ -94,6 +94,20 @@ def test_a_fixed_set_is_rendered_once_and_shared_by_data_modules_that_want_the_s
         assert "rendering" not in caplog.text
 
 
+def test_poses_are_made_once_and_shared_by_data_modules_that_want_the_same(make_datamodule, tmp_path, caplog):
+    def hashes(**changes):
+        caplog.clear()
+        return make_datamodule(num_train=4, cache_dir=tmp_path, **changes).describe(("train",))["pool"]
+
+    with caplog.at_level(logging.INFO, "datamodules.synthetic"):
+        first = hashes()
+        assert "making 4 train poses" in caplog.text
+        assert hashes(seed=1, num_val=1, reuse=2) == first
+        assert "making" not in caplog.text
+        changes = [{"pool_seed": 1}, {"source": EmbeddedSource(jitter_deg=3.0)}]
+        assert len({first["train"], *(hashes(**change)["train"] for change in changes)}) == 3
+
+
 def test_rendering_a_fixed_set_draws_no_global_random_numbers(make_datamodule):
     before = torch.get_rng_state()
     make_datamodule(num_val=1).setup("validate")
