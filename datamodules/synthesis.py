@@ -14,7 +14,7 @@ from datamodules.noise import JOINT_NOISES, add_depth_noise, add_joint_noise, ad
 from datamodules.placement import HEADINGS, check_margin, draw_heading, place
 from datamodules.scenes import KeptScenes, Scene, mirrored
 from datamodules.sources import PoseRecords
-from ljn.body import SMPL, BodyModel
+from ljn.body import SMPL, BodyModel, SparseSMPL
 from ljn.cloud.observation import ObservationRecipe, observe, stack_observations
 from ljn.data import Batch
 from ljn.geometry.camera import Camera, project
@@ -139,7 +139,7 @@ class DepthSynthesizer:
 
     @cached_property
     def _smpl(self) -> SMPL:
-        return SMPL(self.bodies).to(self.dtype)
+        return SparseSMPL(self.bodies).to(self.dtype)
 
     @cached_property
     def _renderer(self) -> Renderer:

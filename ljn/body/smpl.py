@@ -197,8 +197,12 @@ class SMPL(nn.Module):
         # Eq. 3.2: the shape's and the pose's offsets in one product.
         eye = torch.eye(3, dtype=rotmats.dtype, device=rotmats.device)
         features = torch.cat([betas, (rotmats[:, 1:] - eye).flatten(1)], dim=-1)
-        unposed = torch.addmm(self._v_template[slot], features, self._directions[slot])
-        return self._skin(slot, unposed.unflatten(-1, (3, -1)), transforms, rest_joints), joints
+        unposed = self._unposed(slot, features).unflatten(-1, (3, -1))
+        return self._skin(slot, unposed, transforms, rest_joints), joints
+
+    def _unposed(self, slot: int, features: Tensor) -> Tensor:
+        """Vertices `(B, 3V)` before they are skinned, of the betas and the pose's features `(B, 217)`."""
+        return torch.addmm(self._v_template[slot], features, self._directions[slot])
 
     def _forward_kinematics(self, rotmats: Tensor, rest_joints: Tensor) -> Tensor:
         """Each joint's rotation and position, `(B, 24, 3, 4)`, all joints of a level at once."""

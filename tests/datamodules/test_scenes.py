@@ -6,7 +6,7 @@ import torch
 
 from datamodules.scenes import KeptScenes, Scene, mirrored, mirrored_pose
 from datamodules.synthesis import DepthSynthesizer, SynthesisSettings
-from ljn.body import SMPL, load_body_models
+from ljn.body import SMPL, SparseSMPL, load_body_models
 from ljn.body.skeleton import MIRROR, ROOT
 from ljn.cloud.observation import ObservationRecipe
 from ljn.geometry.camera import project
@@ -22,7 +22,7 @@ AGAIN = [(*key, 1) for key in RENDERED]  # every one mirrored
 def make(body_models, source, kinect):
     """Builds a synthesizer of eight embedded records, float64."""
     records = source.records("val", 8, seed=2)
-    layer = SMPL(body_models).double()
+    layer = SparseSMPL(body_models).double()
 
     def build(takes=("points", "crop", "crop_camera"), num_kept=0, dtype=torch.float64, **changes):
         settings, recipe = SynthesisSettings(**changes), ObservationRecipe(64)

@@ -11,7 +11,7 @@ from torch.utils.data import DataLoader
 from datamodules.noise import add_keypoint_noise
 from datamodules.sources import PoseRecords
 from datamodules.synthesis import DepthSynthesizer, SynthesisSettings, concatenate
-from ljn.body import SMPL
+from ljn.body import SMPL, SparseSMPL
 from ljn.body.skeleton import JOINT_INDEX, ROOT
 from ljn.cloud.observation import ObservationRecipe
 from ljn.data import Batch
@@ -33,7 +33,7 @@ TRUTH = ("true_keypoints", "joints", "pose", "betas", "gender", "camera", "sampl
 def make(body_models, source, kinect):
     """Builds a synthesizer of twelve embedded records; float64, as for the fixed sets, unless told otherwise."""
     records = source.records("val", 12, seed=2)
-    layers = {dtype: SMPL(body_models).to(dtype) for dtype in (torch.float32, torch.float64)}
+    layers = {dtype: SparseSMPL(body_models).to(dtype) for dtype in (torch.float32, torch.float64)}
 
     def build(
         seed_key=(0, 0), dtype=torch.float64, records=records, camera=kinect, num_points=64,
