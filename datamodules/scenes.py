@@ -45,13 +45,18 @@ def mirrored(scene: Scene, which: Sequence[bool]) -> Scene:
     just the mirrored joints and image. Of a body that is not, they differ by as much as its sides do. Images are
     changed in place.
     """
+    for image, turn in zip(scene.depth, which):
+        if turn:
+            image[:] = image[:, ::-1]
+    return _mirrored_bodies(scene, which)
+
+
+def _mirrored_bodies(scene: Scene, which: Sequence[bool]) -> Scene:
+    """All of `mirrored` but the images."""
     if not any(which):
         return scene
     is_mirrored = torch.tensor(which)
     joints = scene.joints[:, list(MIRROR)] * scene.joints.new_tensor(_ACROSS)
-    for image, turn in zip(scene.depth, which):
-        if turn:
-            image[:] = image[:, ::-1]
     return scene._replace(
         pose=torch.where(is_mirrored[:, None], mirrored_pose(scene.pose), scene.pose),
         joints=torch.where(is_mirrored[:, None, None], joints, scene.joints),
@@ -82,17 +87,18 @@ class KeptScenes:
         self.number = number
         self._scenes: OrderedDict[object, tuple[Scene, tuple[int, ...], list[_Box]]] = OrderedDict()
 
-    def get(self, key: object) -> Scene | None:
-        """The scene of that key, its images free to be changed; None where it is not kept."""
+    def get(self, key: object, which: Sequence[bool]) -> Scene | None:
+        """The scene of that key as `mirrored` gives it, its images free to be changed; None where it is not kept."""
         if key not in self._scenes:
             return None
         self._scenes.move_to_end(key)
         scene, shape, boxes = self._scenes[key]
         depth = np.zeros(shape, np.float32)
-        for image, box in zip(depth, boxes):
+        for image, box, turn in zip(depth, boxes, which):
             height, width = box.depth.shape
-            image[box.top : box.top + height, box.left : box.left + width] = box.depth
-        return scene._replace(depth=depth)
+            columns = image[:, ::-1] if turn else image
+            columns[box.top : box.top + height, box.left : box.left + width] = box.depth
+        return _mirrored_bodies(scene, which)._replace(depth=depth)
 
     def put(self, key: object, scene: Scene) -> None:
         """Keep a scene, and forget the one that was used least recently where there are too many."""

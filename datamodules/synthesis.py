@@ -158,16 +158,18 @@ class DepthSynthesizer:
 
         A sample depends on its key alone; in float32 up to the rounding of products over a batch.
         """
-        rendered = tuple(key[:2] for key in keys)
-        scene = self._kept.get(rendered)
+        rendered, which = tuple(key[:2] for key in keys), [is_mirrored(key) for key in keys]
+        scene = self._kept.get(rendered, which)
         if scene is None:
             scene = self._render(rendered, self._takes_image)
             self._kept.put(rendered, scene)
-        return self._observe(keys, self._in_use(keys, scene))
+            scene = mirrored(scene, which)
+        return self._observe(keys, self._with_noise(keys, scene))
 
     def examples(self, keys: Sequence[SampleKey]) -> tuple[Batch, Tensor]:
         """The samples of `keys` with the noisy depth images `(B, H, W)`, metres, that they were taken from."""
-        scene = self._in_use(keys, self._render([key[:2] for key in keys], with_depth=True))
+        scene = self._render([key[:2] for key in keys], with_depth=True)
+        scene = self._with_noise(keys, mirrored(scene, [is_mirrored(key) for key in keys]))
         return self._observe(keys, scene), torch.from_numpy(scene.depth)
 
     @property
@@ -212,9 +214,8 @@ class DepthSynthesizer:
             depth = np.zeros((len(keys), 0, 0), np.float32)
         return Scene(pose, betas, gender, joints, [camera] * len(keys), depth)
 
-    def _in_use(self, keys: Sequence[SampleKey], scene: Scene) -> Scene:
-        """A rendered scene as the use that each key names sees it: mirrored or not, with depth noise of its own."""
-        scene = mirrored(scene, [is_mirrored(key) for key in keys])
+    def _with_noise(self, keys: Sequence[SampleKey], scene: Scene) -> Scene:
+        """The scene, depth noise added to its images in place."""
         for image, key in zip(scene.depth, keys):
             add_depth_noise(image, self.settings.depth_noise_m, self._rng(key, _DEPTH_NOISE), in_place=True)
         return scene
