@@ -2,12 +2,16 @@
 
 import multiprocessing
 from collections.abc import Iterator, Mapping
+from itertools import islice
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 from torch.utils.data import BatchSampler, Sampler
+
+BLOCK = 12
+"""Batches that are made before any of them is used again."""
 
 
 class EpochSampler(Sampler[tuple[int, int]]):
@@ -42,10 +46,42 @@ class EpochSampler(Sampler[tuple[int, int]]):
             yield epoch, index
 
 
+class RepeatedBatches(Sampler[list[Any]]):
+    """Batches in blocks of `BLOCK`, each block `times` times over, with the number of the time added to the keys.
+
+    As many batches as there were: only the first ones come, and the last block is cut off. Between two uses of a batch
+    lie `BLOCK - 1` others, and one worker of 1, 2, 3, 4, 6 or 12 gets them all.
+    """
+
+    def __init__(self, batches: BatchSampler, times: int) -> None:
+        self.batches = batches
+        self.times = times
+
+    @property
+    def sampler(self) -> Any:
+        """The samples' order, which the trainer tells the epoch."""
+        return self.batches.sampler
+
+    def __len__(self) -> int:
+        return len(self.batches)
+
+    def __iter__(self) -> Iterator[list[Any]]:
+        batches: Iterator[list[Any]] = iter(self.batches)
+        left = len(self)
+        while left:
+            block = list(islice(batches, min(BLOCK, left)))
+            for use in range(self.times):
+                for batch in block[:left]:
+                    yield [(*key, use) for key in batch]
+                left -= min(len(block), left)
+
+
 class SharedBatches(Sampler[list[Any]]):
     """One process's equal part of every batch, so that several processes take the steps that one would take."""
 
-    def __init__(self, batches: BatchSampler, process: int = 0, num_processes: int = 1) -> None:
+    def __init__(
+        self, batches: BatchSampler | RepeatedBatches, process: int = 0, num_processes: int = 1
+    ) -> None:
         self.batches = batches
         self.process = process
         self.num_processes = num_processes

@@ -1,4 +1,4 @@
-"""Fixed sets of samples on disk: made once, shared by every run that asks for the same ones."""
+"""Fixed sets of samples, and tables of poses, on disk: made once, shared by every run that asks for the same ones."""
 
 import json
 import os
@@ -13,6 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from datamodules.sources import PoseRecords
 from ljn.reading import READ_ERRORS, read_json, reason
 
 
@@ -51,6 +52,34 @@ def cached_samples(directory: Path, key: str, make: Callable[[], Mapping[str, Te
     finally:
         shutil.rmtree(draft, ignore_errors=True)
     return _read(place)
+
+
+def cached_records(directory: Path, key: str, make: Callable[[], PoseRecords]) -> PoseRecords:
+    """The records stored in `directory` under `key`, made and stored first where they are missing.
+
+    As `cached_samples`: a key says all that they depend on, and arrays are read when they are touched.
+    """
+
+    def columns() -> dict[str, Tensor]:
+        records = make()
+        # Text of one length, as its characters' numbers.
+        letters = np.ascontiguousarray(records.sequence).view(np.int32).reshape(len(records), -1)
+        numbers = {
+            "pose": records.pose,
+            "betas": records.betas,
+            "gender": records.gender,
+            "frame": records.frame,
+        }
+        return {
+            **{name: torch.from_numpy(column) for name, column in numbers.items()},
+            "sequence": torch.from_numpy(letters),
+            "has_heading": torch.full((len(records),), records.has_heading),
+        }
+
+    stored = {name: column.numpy() for name, column in cached_samples(directory, key, columns).items()}
+    letters, has_heading = stored.pop("sequence"), stored.pop("has_heading")
+    sequence = letters.view(f"<U{letters.shape[1]}").reshape(-1)
+    return PoseRecords(**stored, sequence=sequence, has_heading=bool(has_heading.all()))
 
 
 def _read(place: Path) -> dict[str, Tensor]:

@@ -1,5 +1,6 @@
 """The noise of training data: on depth images, on 2D keypoints and on 3D joints."""
 
+import numba
 import numpy as np
 
 JOINT_NOISES = ("planar", "isotropic")
@@ -13,10 +14,36 @@ def add_depth_noise(
     The draws do not depend on `noise_std_m`, metres. With `in_place`, `depth` itself gets the noise, else a copy.
     """
     noisy = depth if in_place else depth.copy()
-    flat = noisy.reshape(-1)
-    foreground = np.flatnonzero(flat > 0)
-    flat[foreground] += np.float32(noise_std_m) * rng.standard_normal(len(foreground), dtype=np.float32)
+    noise = rng.standard_normal(_num_foreground(noisy), dtype=np.float32)
+    noise *= np.float32(noise_std_m)
+    _add_to_foreground(noisy, noise)
     return noisy
+
+
+@numba.njit(cache=True, nogil=True)
+def _num_foreground(depth: np.ndarray) -> int:
+    """How many pixels of `(H, W)` show the body."""
+    number = 0
+    for v in range(depth.shape[0]):
+        for u in range(depth.shape[1]):
+            number += depth[v, u] > 0.0
+    return number
+
+
+@numba.njit(cache=True, nogil=True)
+def _add_to_foreground(depth: np.ndarray, noise: np.ndarray) -> None:
+    """Add to each pixel of `(H, W)` that shows the body the next number of `noise`, row by row."""
+    k = 0
+    for v in range(depth.shape[0]):
+        is_empty = True
+        for u in range(depth.shape[1]):  # without a jump, some pixels at once
+            is_empty &= depth[v, u] <= 0.0
+        if is_empty:
+            continue
+        for u in range(depth.shape[1]):
+            if depth[v, u] > 0.0:
+                depth[v, u] += noise[k]
+                k += 1
 
 
 def add_keypoint_noise(keypoints: np.ndarray, noise_px: float, rng: np.random.Generator) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 import math
 
+import numba
 import numpy as np
 
 from ljn.geometry.camera import Camera
@@ -67,16 +68,17 @@ def place(
         ValueError: The image is smaller than its two margins.
     """
     check_margin(camera, margin_px)
-    z = vertices[:, 2]
-    centre = (z.min() + z.max()) / 2
-    depth = distance_m[0] + uniform[2] * (distance_m[1] - distance_m[0]) - centre
     # Slopes of the picture's borders, less the margin: x in [left, right] * depth is in the picture.
     axes = ((camera.fx, camera.cx, camera.width), (camera.fy, camera.cy, camera.height))
+    slopes = [
+        ((margin_px - middle) / focal, (size - 1 - margin_px - middle) / focal)
+        for focal, middle, size in axes
+    ]
+    nearest, farthest, *rooms = _extent(vertices, np.array(slopes, vertices.dtype))
+    centre = (nearest + farthest) / 2
+    depth = distance_m[0] + uniform[2] * (distance_m[1] - distance_m[0]) - centre
     borders = []
-    for axis, (focal, middle, size) in enumerate(axes):
-        low, high = (margin_px - middle) / focal, (size - 1 - margin_px - middle) / focal
-        from_low = (low * z - vertices[:, axis]).max()
-        to_high = (high * z - vertices[:, axis]).min()
+    for (low, high), from_low, to_high in zip(slopes, rooms[::2], rooms[1::2]):
         depth = max(depth, (from_low - to_high) / (high - low))
         borders.append((low, high, from_low, to_high))
     shift = [
@@ -84,3 +86,23 @@ def place(
         for axis, (low, high, from_low, to_high) in enumerate(borders)
     ]
     return np.array([*shift, depth])
+
+
+@numba.njit(cache=True, nogil=True)
+def _extent(vertices: np.ndarray, slopes: np.ndarray) -> np.ndarray:
+    """Least and greatest z; for x, then y, the greatest of low * z - x and the least of high * z - x; `(6,)`.
+
+    `slopes` are `(2, 2)`: low and high for x, then y. All in the precision of `vertices` `(V, 3)`.
+    """
+    extent = np.empty(6, vertices.dtype)
+    extent[0], extent[1] = vertices[0, 2], vertices[0, 2]
+    for axis in range(2):
+        extent[2 + 2 * axis] = slopes[axis, 0] * vertices[0, 2] - vertices[0, axis]
+        extent[3 + 2 * axis] = slopes[axis, 1] * vertices[0, 2] - vertices[0, axis]
+    for i in range(1, len(vertices)):
+        z = vertices[i, 2]
+        extent[0], extent[1] = min(extent[0], z), max(extent[1], z)
+        for axis in range(2):
+            extent[2 + 2 * axis] = max(extent[2 + 2 * axis], slopes[axis, 0] * z - vertices[i, axis])
+            extent[3 + 2 * axis] = min(extent[3 + 2 * axis], slopes[axis, 1] * z - vertices[i, axis])
+    return extent

@@ -4,7 +4,7 @@ import math
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple, cast
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -12,22 +12,31 @@ from torch import Tensor
 
 from datamodules.noise import JOINT_NOISES, add_depth_noise, add_joint_noise, add_keypoint_noise
 from datamodules.placement import HEADINGS, check_margin, draw_heading, place
+from datamodules.scenes import KeptScenes, Scene, mirrored
 from datamodules.sources import PoseRecords
-from ljn.body import SMPL, BodyModel
+from ljn.body import SMPL, BodyModel, SparseSMPL
 from ljn.body.skeleton import NUM_JOINTS
 from ljn.cloud.observation import ObservationRecipe, observe, stack_observations
 from ljn.data import Batch
 from ljn.geometry.camera import Camera, project
-from ljn.geometry.rotations import CAMERA_FROM_BODY, rotation_about, rotmat_to_rotvec, rotvec_to_rotmat
+from ljn.geometry.rotations import body_to_camera, rotation_about, rotmat_to_rotvec, rotvec_to_rotmat
 from ljn.pipeline.keypoints import fill_missing
 from ljn.render import RENDERERS, Renderer, get_renderer
 
 # Each purpose has a generator of its own: changing one (the number of points, a sigma) leaves the others' draws.
 _PLACEMENT, _DEPTH_NOISE, _SAMPLING, _KEYPOINTS, _JOINTS, _MISSING, _CAMERA = range(7)
 
+SampleKey = tuple[int, ...]
+"""An epoch, a record's index and, where a render is used again, the number of that use; without it, the first, 0."""
+
 SAMPLES_VERSION = 1
 """Raised with every change of the samples made of the same records: results are comparable within a version only."""
 INITIAL_JOINTS = ("lifted", "noised")
+
+
+def is_mirrored(key: SampleKey) -> bool:
+    """Whether a sample shows its render mirrored: every second use does."""
+    return sum(key[2:]) % 2 == 1
 
 
 @dataclass(frozen=True)
@@ -115,8 +124,10 @@ class DepthSynthesizer:
         settings: See `SynthesisSettings`.
         recipe: How depth images are observed.
         takes: What of an observation is made beside keypoints and initial joints: see `ljn.cloud.observation.PARTS`.
+            Where none of it comes from a depth image, none is rendered.
         seed_key: What the random draws depend on, beside a sample's epoch and index: a seed and a split number.
         dtype: Precision of the body; float64 makes fixed sets agree across machines.
+        num_kept: How many batches' renders are kept, for batches of the same bodies to come.
     """
 
     def __init__(
@@ -129,6 +140,7 @@ class DepthSynthesizer:
         takes: Collection[str],
         seed_key: tuple[int, int],
         dtype: torch.dtype = torch.float32,
+        num_kept: int = 0,
     ) -> None:
         if settings.heading == "source" and not records.has_heading:
             raise ValueError(
@@ -143,46 +155,71 @@ class DepthSynthesizer:
         self.takes = {*takes, "keypoints", "initial_joints"}
         self.seed_key = seed_key
         self.dtype = dtype
+        self.num_kept = num_kept
 
     def __getstate__(self) -> dict[str, Any]:
-        lazy = ("_smpl", "_renderer")
+        lazy = ("_smpl", "_renderer", "_kept")
         return {name: value for name, value in self.__dict__.items() if name not in lazy}
 
     @cached_property
     def _smpl(self) -> SMPL:
-        return SMPL(self.bodies).to(self.dtype)
+        return SparseSMPL(self.bodies).to(self.dtype)
 
     @cached_property
     def _renderer(self) -> Renderer:
         return get_renderer(self.settings.renderer)
 
-    def _rng(self, epoch: int, index: int, purpose: int) -> np.random.Generator:
-        return np.random.default_rng([*self.seed_key, epoch, index, purpose])
+    @cached_property
+    def _kept(self) -> KeptScenes:
+        return KeptScenes(self.num_kept)
 
-    def batch(self, keys: Sequence[tuple[int, int]]) -> Batch:
-        """The samples of `keys`, each an epoch and a record's index.
+    def _rng(self, key: SampleKey, purpose: int) -> np.random.Generator:
+        epoch, index, *use = key
+        return np.random.default_rng([*self.seed_key, epoch, index, purpose, *(use if any(use) else ())])
+
+    def batch(self, keys: Sequence[SampleKey]) -> Batch:
+        """The samples of `keys`.
 
         A sample depends on its key alone; in float32 up to the rounding of products over a batch.
         """
-        return self._observe(keys, self._render(keys))
+        rendered, which = tuple(key[:2] for key in keys), [is_mirrored(key) for key in keys]
+        scene = self._kept.get(rendered, which)
+        if scene is None:
+            scene = self._render(rendered, self._takes_image)
+            self._kept.put(rendered, scene)
+            scene = mirrored(scene, which)
+        return self._observe(keys, self._with_noise(keys, scene))
 
-    def examples(self, keys: Sequence[tuple[int, int]]) -> tuple[Batch, Tensor]:
+    def examples(self, keys: Sequence[SampleKey]) -> tuple[Batch, Tensor]:
         """The samples of `keys` with the noisy depth images `(B, H, W)`, metres, that they were taken from.
 
         Smaller images lie in the upper left corner.
         """
-        scene = self._render(keys)
+        scene = self._render([key[:2] for key in keys], with_depth=True)
+        scene = self._with_noise(keys, mirrored(scene, [is_mirrored(key) for key in keys]))
         depth = torch.zeros(len(keys), *np.max([image.shape for image in scene.depth], 0))
         for whole, image in zip(depth, scene.depth):
             whole[: image.shape[0], : image.shape[1]] = torch.from_numpy(image)
         return self._observe(keys, scene), depth
 
+    @property
+    def _seen(self) -> frozenset[str]:
+        """What is made by `observe`; joints with noise are not."""
+        return frozenset(
+            self.takes - ({"initial_joints"} if self.settings.initial_joints == "noised" else set())
+        )
+
+    @property
+    def _takes_image(self) -> bool:
+        """Whether anything that is taken comes from a depth image."""
+        return bool(self._seen - {"keypoints", "confidences"})
+
     @torch.no_grad()
-    def _render(self, keys: Sequence[tuple[int, int]]) -> "_Scene":
-        """Pose the bodies, place them before the camera, take noisy depth images."""
+    def _render(self, keys: Sequence[SampleKey], with_depth: bool) -> Scene:
+        """Pose the bodies, place them before their cameras, render them where depth is wanted."""
         settings = self.settings
-        cameras = [self._camera_of(*key) for key in keys]
-        placement = [self._rng(epoch, index, _PLACEMENT) for epoch, index in keys]
+        cameras = [self._camera_of(key) for key in keys]
+        placement = [self._rng(key, _PLACEMENT) for key in keys]
         rows = [index for _, index in keys]
         pose = torch.from_numpy(self.records.pose[rows]).to(self.dtype)
         heading = torch.tensor([draw_heading(settings.heading, rng) for rng in placement], dtype=self.dtype)
@@ -192,8 +229,7 @@ class DepthSynthesizer:
 
         gender = torch.from_numpy(self.records.gender[rows])
         vertices, joints = self._smpl(pose, betas, gender)
-        cam_from_body = CAMERA_FROM_BODY.to(self.dtype)
-        vertices, joints = vertices @ cam_from_body.T, joints @ cam_from_body.T
+        vertices, joints = body_to_camera(vertices), body_to_camera(joints)
         transl = torch.from_numpy(
             np.stack(
                 [
@@ -202,21 +238,19 @@ class DepthSynthesizer:
                 ]
             )
         ).to(self.dtype)
-        vertices, joints = vertices + transl[:, None], joints + transl[:, None]
+        joints = joints + transl[:, None]
+        if with_depth:
+            depth = self._images(vertices + transl[:, None], cameras)
+        else:
+            depth = [np.zeros((0, 0), np.float32)] * len(keys)
+        return Scene(pose, betas, gender, joints, cameras, depth)
 
-        depth = self._images(vertices, cameras)
-        for image, (epoch, index) in zip(depth, keys):
-            add_depth_noise(
-                image, settings.depth_noise_m, self._rng(epoch, index, _DEPTH_NOISE), in_place=True
-            )
-        return _Scene(pose, betas, gender, joints, cameras, depth)
-
-    def _camera_of(self, epoch: int, index: int) -> Camera:
+    def _camera_of(self, key: SampleKey) -> Camera:
         """The camera of a sample."""
         ranges = (self.settings.focal_factors, self.settings.pixel_factors)
         if all(low == high == 1 for low, high in ranges):
             return self.camera
-        rng = self._rng(epoch, index, _CAMERA)
+        rng = self._rng(key, _CAMERA)
         factors = [math.exp(rng.uniform(math.log(low), math.log(high))) for low, high in ranges]
         return _varied(self.camera, *factors)
 
@@ -229,25 +263,30 @@ class DepthSynthesizer:
             for mesh, camera in zip(vertices, cameras)
         ]
 
-    def _observe(self, keys: Sequence[tuple[int, int]], scene: "_Scene") -> Batch:
+    def _with_noise(self, keys: Sequence[SampleKey], scene: Scene) -> Scene:
+        """The scene, depth noise added to its images in place."""
+        for image, key in zip(scene.depth, keys):
+            add_depth_noise(image, self.settings.depth_noise_m, self._rng(key, _DEPTH_NOISE), in_place=True)
+        return scene
+
+    def _observe(self, keys: Sequence[SampleKey], scene: Scene) -> Batch:
         """Observe the depth images; add the truth."""
         settings = self.settings
         intrinsics = torch.stack([camera.intrinsics(self.dtype) for camera in scene.cameras])
         keypoints = project(scene.joints, intrinsics).float()
         observations = []
-        for i, (epoch, index) in enumerate(keys):
-            camera = scene.cameras[i]
+        for i, (key, camera) in enumerate(zip(keys, scene.cameras)):
             noise_px = settings.keypoint_noise_px * camera.fx / self.camera.fx
-            noisy = add_keypoint_noise(keypoints[i].numpy(), noise_px, self._rng(epoch, index, _KEYPOINTS))
-            kept, confidences = self._kept(noisy, epoch, index)
-            sampling = self._rng(epoch, index, _SAMPLING)
-            made = observe(scene.depth[i], camera, kept, self.recipe, self.takes, sampling, confidences)
+            noisy = add_keypoint_noise(keypoints[i].numpy(), noise_px, self._rng(key, _KEYPOINTS))
+            left, confidences = self._left(noisy, key)
+            sampling = self._rng(key, _SAMPLING)
+            made = observe(scene.depth[i], camera, left, self.recipe, self._seen, sampling, confidences)
             if settings.initial_joints == "noised":
                 made["initial_joints"] = add_joint_noise(
                     scene.joints[i].numpy(),
                     settings.joint_noise_m,
                     settings.joint_noise,
-                    self._rng(epoch, index, _JOINTS),
+                    self._rng(key, _JOINTS),
                 )
             observations.append(made)
         return Batch(
@@ -258,20 +297,18 @@ class DepthSynthesizer:
             betas=scene.betas.float(),
             gender=scene.gender,
             camera=intrinsics.float(),
-            sample_id=torch.tensor([index for _, index in keys]),
+            sample_id=torch.tensor([index for _, index, *_ in keys]),
         )
 
-    def _kept(
-        self, keypoints: np.ndarray, epoch: int, index: int
-    ) -> tuple[np.ndarray | None, np.ndarray | None]:
+    def _left(self, keypoints: np.ndarray, key: SampleKey) -> tuple[np.ndarray | None, np.ndarray | None]:
         """Keypoints, those that are missing filled in, and confidences; None where none is left."""
         if not any(self.settings.missing_keypoints):
             return keypoints, None
-        rng = self._rng(epoch, index, _MISSING)
-        is_kept = rng.random(NUM_JOINTS) >= rng.choice(self.settings.missing_keypoints)
-        if not is_kept.any():
+        rng = self._rng(key, _MISSING)
+        is_left = rng.random(NUM_JOINTS) >= rng.choice(self.settings.missing_keypoints)
+        if not is_left.any():
             return None, None
-        return fill_missing(np.where(is_kept[:, None], keypoints, np.nan)), is_kept.astype(np.float32)
+        return fill_missing(np.where(is_left[:, None], keypoints, np.nan)), is_left.astype(np.float32)
 
 
 def _varied(camera: Camera, focal_factor: float, pixel_factor: float) -> Camera:
@@ -286,17 +323,6 @@ def _varied(camera: Camera, focal_factor: float, pixel_factor: float) -> Camera:
         width,
         height,
     )
-
-
-class _Scene(NamedTuple):
-    """Bodies before their cameras: `(B, 72)`, `(B, 10)`, `(B,)`, `(B, 24, 3)`; noisy depth `(H, W)` each, metres."""
-
-    pose: Tensor
-    betas: Tensor
-    gender: Tensor
-    joints: Tensor
-    cameras: list[Camera]
-    depth: list[np.ndarray]
 
 
 def concatenate(batches: Iterable[Batch], num_samples: int) -> dict[str, Tensor]:

@@ -2,5 +2,6 @@
 
 from ljn.body.files import GENDERS, BodyModel, load_body_model, load_body_models
 from ljn.body.smpl import SMPL, SMPLOutput
+from ljn.body.sparse import SparseSMPL
 
-__all__ = ["GENDERS", "SMPL", "BodyModel", "SMPLOutput", "load_body_model", "load_body_models"]
+__all__ = ["GENDERS", "SMPL", "BodyModel", "SMPLOutput", "SparseSMPL", "load_body_model", "load_body_models"]

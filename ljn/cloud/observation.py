@@ -144,7 +144,7 @@ def crop_body(depth: np.ndarray, camera: Camera, size_px: int) -> tuple[np.ndarr
     Raises:
         ValueError: The mask is empty.
     """
-    left, right, top, bottom = _box(depth)
+    left, right, top, bottom = body_box(depth)
     if right < left:
         raise ValueError("depth: the mask is empty, no pixel shows the body")
     side = _CROP_MARGIN * max(right - left, bottom - top) + _CROP_BORDER_PX
@@ -176,7 +176,7 @@ def _cloud(
 
 def _no_keypoints(depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Keypoints in the middle of the body, and their confidences of 0."""
-    left, right, top, bottom = _box(depth)
+    left, right, top, bottom = body_box(depth)
     middle = np.array([(left + right) / 2, (top + bottom) / 2], np.float32)
     return np.tile(middle, (NUM_JOINTS, 1)), np.zeros(NUM_JOINTS)
 
@@ -193,8 +193,8 @@ def _every(step: int, depth: np.ndarray, camera: Camera) -> tuple[np.ndarray, Ca
 
 
 @numba.njit(cache=True, nogil=True)
-def _box(depth: np.ndarray) -> tuple[int, int, int, int]:
-    """First and last column, first and last row of the body."""
+def body_box(depth: np.ndarray) -> tuple[int, int, int, int]:
+    """First and last column, first and last row of a body in a depth image; the last before the first without one."""
     height, width = depth.shape
     left, right, top, bottom = width, -1, height, -1
     for v in range(height):

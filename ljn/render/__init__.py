@@ -5,6 +5,7 @@ accelerator and never leaves it. `pyrender` is the thesis's way, through EGL. `o
 independent reference. All sample at integer pixel centres.
 """
 
+import math
 from abc import ABC, abstractmethod
 from importlib import import_module
 from typing import NamedTuple
@@ -114,11 +115,9 @@ def check_vertices(vertices: Tensor) -> None:
         raise ValueError(f"vertices: expected (B, V, 3), got {tuple(vertices.shape)}")
     if not vertices.numel():
         return
-    # One transfer from the device for both answers.
-    is_finite, nearest = torch.stack(
-        [vertices.isfinite().all().to(vertices.dtype), vertices[..., 2].amin()]
-    ).tolist()
-    if not is_finite:
+    # One transfer from the device for all answers; NaN comes through.
+    *ends, nearest = torch.stack([*vertices.aminmax(), vertices[..., 2].amin()]).tolist()
+    if not all(map(math.isfinite, ends)):
         raise ValueError("vertices: NaN or infinite values; check the pose, the shape and the translation")
     if nearest <= 0:
         raise ValueError(

@@ -100,13 +100,9 @@ def _draw_face(
             if nearest <= buffer[v, u]:
                 continue
             ea = sign * ((ub - u) * (vc - v) - (uc - u) * (vb - v))
-            if ea < 0.0:
-                continue
             eb = sign * ((uc - u) * (va - v) - (ua - u) * (vc - v))
-            if eb < 0.0:
-                continue
             ec = sign * ((ua - u) * (vb - v) - (ub - u) * (va - v))
-            if ec < 0.0:
+            if min(ea, min(eb, ec)) < 0.0:  # one jump, which is foretold more often than three
                 continue
             total = ea + eb + ec
             if total == 0.0:  # a sliver thinner than rounding: its neighbours have this pixel
@@ -178,7 +174,10 @@ class ZBuffer(Renderer):
 
 
 def _as_arrays(vertices: Tensor, faces: Tensor) -> tuple[np.ndarray, np.ndarray]:
-    """The meshes `(B, V, 3)` in float64 and the faces `(F, 3)` in int64, for numba."""
+    """The meshes `(B, V, 3)` in float32 or float64 and the faces `(F, 3)` in int64, for numba."""
     check_vertices(vertices)
-    meshes = np.ascontiguousarray(vertices.detach().cpu().double().numpy())
+    on_cpu = vertices.detach().cpu()
+    if on_cpu.dtype not in (torch.float32, torch.float64):
+        on_cpu = on_cpu.double()
+    meshes = np.ascontiguousarray(on_cpu.numpy())
     return meshes, np.ascontiguousarray(faces.cpu().numpy(), dtype=np.int64)

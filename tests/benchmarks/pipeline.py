@@ -5,6 +5,7 @@ processes, everything else from one thread. Rows are timed in turn over several 
 over the rounds: a machine that changes its speed changes it for all rows of a round.
 """
 
+import itertools
 import statistics
 import time
 from collections.abc import Callable, Iterator
@@ -16,11 +17,12 @@ import torch
 from torch import Tensor
 from torch.utils.data import DataLoader
 
+from datamodules.batches import BLOCK, RepeatedBatches
 from datamodules.noise import add_depth_noise
 from datamodules.sources.embedded import EmbeddedSource
 from datamodules.synthesis import DepthSynthesizer, SynthesisSettings
 from datamodules.synthetic import SynthesizedSamples
-from ljn.body import SMPL, SMPLOutput, load_body_models
+from ljn.body import SMPL, SMPLOutput, SparseSMPL, load_body_models
 from ljn.cloud.normals import get_normal_estimator
 from ljn.cloud.observation import ObservationRecipe
 from ljn.cloud.sampling import sample_cloud
@@ -116,6 +118,20 @@ def time_loaders(title: str, synthesizers: dict[str, DepthSynthesizer]) -> None:
     print_rows(title, found)
 
 
+def time_reuse(title: str, rows: dict[str, tuple[int, DepthSynthesizer]]) -> None:
+    """Time whole samples in one thread, as many of each render as the row says, and print a block of the table."""
+    number, epochs = 4 * BLOCK, itertools.count()
+
+    def make(reuse: int, synthesizer: DepthSynthesizer) -> None:
+        some = itertools.islice(epochs, number)  # of which nothing is kept yet
+        plain = [[(epoch, index) for index in range(BATCH)] for epoch in some]
+        for keys in RepeatedBatches(plain, reuse):  # type: ignore[arg-type]
+            synthesizer.batch(keys)
+
+    calls = {name: lambda row=row: make(*row) for name, row in rows.items()}  # type: ignore[misc]
+    time_rows(title, calls, per_call=number * BATCH, rounds=3)  # type: ignore[arg-type]
+
+
 def _as_is(batch: Any) -> Any:
     return batch
 
@@ -179,6 +195,21 @@ def main() -> None:
             },
         )
 
+    recipe, noised = ObservationRecipe(1024), SynthesisSettings(initial_joints="noised")
+    for title, settings, takes in (
+        ("1024 points", SynthesisSettings(), ("points",)),
+        ("crops", SynthesisSettings(), ("crop", "crop_camera")),
+        ("joints with noise alone", noised, ()),
+    ):
+        given = (records, bodies, CAMERA, settings, recipe, takes, (0, 0), torch.float32)
+        time_reuse(
+            f"{title}, one thread, data.reuse",
+            {
+                f"{reuse} of each render": (reuse, DepthSynthesizer(*given, BLOCK if reuse > 1 else 0))
+                for reuse in (1, 2, 4)
+            },
+        )
+
     smpl = SMPL(bodies)
     with torch.no_grad():
         vertices = smpl(*columns).vertices @ CAMERA_FROM_BODY.float().T
@@ -203,7 +234,11 @@ def main() -> None:
         },
     )
     with torch.no_grad():
-        time_rows("the body alone", {f"SMPL layer, two genders, batch {BATCH}": lambda: smpl(*columns)})
+        layers = {"from nonzero offsets": SparseSMPL(bodies), "SMPL layer": smpl}
+        time_rows(
+            f"the body alone, two genders, batch {BATCH}",
+            {name: lambda layer=layer: layer(*columns) for name, layer in layers.items()},  # type: ignore[misc]
+        )
 
     points, joints = torch.randn(BATCH, 1024, 6) * 0.3, torch.randn(BATCH, 24, 3) * 0.3
     sizes = {

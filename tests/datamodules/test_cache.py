@@ -2,12 +2,13 @@ import json
 import multiprocessing
 import os
 import signal
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
-from datamodules.cache import cached_samples
+from datamodules.cache import cached_records, cached_samples
 
 
 def make_samples(value=0.5):
@@ -34,6 +35,18 @@ def test_a_set_is_made_once_and_read_back_equal(tmp_path):
     assert_equal(cached_samples(directory, "another key", lambda: view), view)
     cached_samples(directory, "key", never)["points"].zero_()
     assert_equal(cached_samples(directory, "key", never), make_samples())
+
+
+@pytest.mark.parametrize("has_heading", [False, True])
+def test_a_table_of_poses_is_made_once_and_read_back_equal(tmp_path, source, has_heading):
+    made = replace(source.records("val", 6, seed=1), has_heading=has_heading)
+    assert len({len(name) for name in made.sequence}) > 1
+    for read in (cached_records(tmp_path, "key", lambda: made), cached_records(tmp_path, "key", never)):
+        assert (read.hash, read.has_heading) == (made.hash, has_heading)
+        for name in ("pose", "betas", "gender", "sequence", "frame"):
+            one, other = getattr(read, name), getattr(made, name)
+            assert one.dtype == other.dtype
+            assert np.array_equal(one, other), name
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ from torch.utils.data import DataLoader
 from datamodules.noise import add_keypoint_noise
 from datamodules.sources import PoseRecords
 from datamodules.synthesis import DepthSynthesizer, SynthesisSettings, concatenate
-from ljn.body import SMPL
+from ljn.body import SMPL, SparseSMPL
 from ljn.body.skeleton import JOINT_INDEX, ROOT
 from ljn.cloud.observation import ObservationRecipe
 from ljn.data import Batch
@@ -33,7 +33,7 @@ TRUTH = ("true_keypoints", "joints", "pose", "betas", "gender", "camera", "sampl
 def make(body_models, source, kinect):
     """Builds a synthesizer of twelve embedded records; float64, as for the fixed sets, unless told otherwise."""
     records = source.records("val", 12, seed=2)
-    layers = {dtype: SMPL(body_models).to(dtype) for dtype in (torch.float32, torch.float64)}
+    layers = {dtype: SparseSMPL(body_models).to(dtype) for dtype in (torch.float32, torch.float64)}
 
     def build(
         seed_key=(0, 0), dtype=torch.float64, records=records, camera=kinect, num_points=64,
@@ -155,6 +155,20 @@ def test_the_depth_noise_leaves_keypoints_places_and_the_choice_of_pixels(make, 
     torch.testing.assert_close(*pixels, atol=1e-3, rtol=0)
     noise = batch["points"][..., 2] - clean["points"][..., 2]
     assert float(noise.std()) == pytest.approx(0.001, rel=0.1)
+
+
+def test_joints_with_noise_need_no_image_and_are_the_same_as_with_one(make):
+    seen = make(initial_joints="noised").batch(KEYS)
+    blind = make(initial_joints="noised", takes=())
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(blind.__dict__, "_renderer", None)
+        unseen = blind.batch(KEYS)
+    assert set(unseen) == set(seen) - {"points"}
+    assert all(torch.equal(unseen[name], seen[name]) for name in unseen)
+    assert not torch.equal(unseen["initial_joints"], unseen["joints"])
+    examples, depth = blind.examples(KEYS[:2])  # these show what is not taken
+    assert (depth > 0).flatten(1).any(1).all()
+    torch.testing.assert_close(examples["initial_joints"], unseen["initial_joints"][:2], atol=1e-5, rtol=0)
 
 
 def test_a_synthesizer_survives_its_way_to_another_process(make, batch):

@@ -11,7 +11,7 @@ import pytest
 import torch
 from lightning.fabric.utilities.data import _set_sampler_epoch
 
-from datamodules.batches import EpochSampler
+from datamodules.batches import BLOCK, EpochSampler, RepeatedBatches
 from datamodules.placement import place
 from datamodules.sources import SPLITS
 from datamodules.sources.embedded import EmbeddedSource
@@ -28,8 +28,9 @@ def train_loader(make_datamodule, tmp_path_factory):
     """Builds a data module's loader of training samples; their validation sample is rendered but once."""
     cache_dir = tmp_path_factory.mktemp("validation")
 
-    def make(**changes):
+    def make(takes=("points", "initial_joints"), **changes):
         datamodule = make_datamodule(num_val=1, cache_dir=cache_dir, **changes)
+        datamodule.takes = takes
         datamodule.setup("fit")
         return datamodule.train_dataloader()
 
@@ -93,6 +94,20 @@ def test_a_fixed_set_is_rendered_once_and_shared_by_data_modules_that_want_the_s
         assert "rendering" not in caplog.text
 
 
+def test_poses_are_made_once_and_shared_by_data_modules_that_want_the_same(make_datamodule, tmp_path, caplog):
+    def hashes(**changes):
+        caplog.clear()
+        return make_datamodule(num_train=4, cache_dir=tmp_path, **changes).describe(("train",))["pool"]
+
+    with caplog.at_level(logging.INFO, "datamodules.synthetic"):
+        first = hashes()
+        assert "making 4 train poses" in caplog.text
+        assert hashes(seed=1, num_val=1, reuse=2) == first
+        assert "making" not in caplog.text
+        changes = [{"pool_seed": 1}, {"source": EmbeddedSource(jitter_deg=3.0)}]
+        assert len({first["train"], *(hashes(**change)["train"] for change in changes)}) == 3
+
+
 def test_rendering_a_fixed_set_draws_no_global_random_numbers(make_datamodule):
     before = torch.get_rng_state()
     make_datamodule(num_val=1).setup("validate")
@@ -143,7 +158,7 @@ def test_the_key_of_a_fixed_set_follows_everything_that_it_depends_on(make_datam
 
 
 def test_the_key_of_a_fixed_set_does_not_follow_what_leaves_the_samples_alone(make_datamodule, tmp_path):
-    same = {"seed": 1, "num_train": 9, "batch_size": 2, "num_workers": 2, "cache_dir": tmp_path}
+    same = {"seed": 1, "num_train": 9, "reuse": 2, "batch_size": 2, "num_workers": 2, "cache_dir": tmp_path}
     changes = [{}, *({name: value} for name, value in same.items())]
     assert len({make_datamodule(**change).fixed_key("val") for change in changes}) == 1
 
@@ -207,6 +222,75 @@ def test_the_sampler_gives_every_index_once_with_its_epoch():
         orders.append(indices)
     assert len(set(orders)) == 3
     assert len(sampler) == 50
+
+
+# Renders that are used again
+
+
+@pytest.mark.parametrize(("num_batches", "times"), [(60, 2), (60, 4), (24, 2), (25, 3), (7, 2), (1, 5)])
+def test_batches_come_again_in_blocks_and_no_sooner(num_batches, times):
+    plain = [[(0, 2 * i), (0, 2 * i + 1)] for i in range(num_batches)]
+    repeated = list(RepeatedBatches(plain, times))
+    assert len(repeated) == num_batches == len(RepeatedBatches(plain, times))
+    assert repeated[:BLOCK] == [[(*key, 0) for key in batch] for batch in plain[:BLOCK]]
+    assert len({key for batch in repeated for key in batch}) == 2 * num_batches
+    seen = {}
+    for position, batch in enumerate(repeated):
+        rendered, (use,) = tuple(key[:2] for key in batch), {key[2] for key in batch}
+        assert list(rendered) in plain
+        last, its_use = seen.get(rendered, (position - BLOCK, use - 1))
+        assert (position - last, use - its_use) == (BLOCK, 1)
+        seen[rendered] = position, use
+    assert len(seen) <= num_batches / times + BLOCK
+
+
+def test_the_first_uses_are_the_samples_of_a_training_that_uses_each_once(train_loader):
+    given = {"num_train": 60, "batch_size": 2, "num_points": 4}
+    plain, twice = (list(train_loader(**given, reuse=reuse)) for reuse in (None, 2))
+    assert len(plain) == len(twice) == 30
+    for one, other in zip(plain[:BLOCK], twice):
+        assert_same_bits(one, other)
+    for one, other in zip(plain[:BLOCK], twice[BLOCK:]):
+        assert torch.equal(one["sample_id"], other["sample_id"])
+        assert torch.equal(one["betas"], other["betas"])
+        for name in ("points", "joints", "keypoints", "initial_joints"):
+            assert (one[name] != other[name]).flatten(1).any(1).all(), name
+    for one, other in zip(plain[BLOCK:], twice[2 * BLOCK :]):
+        assert_same_bits(one, other)
+
+
+@pytest.mark.filterwarnings("ignore:This DataLoader will create 5 worker processes")
+@pytest.mark.parametrize("num_workers", [1, 2, 5])
+def test_reused_batches_are_the_same_bits_for_any_number_of_workers_and_in_a_resumed_epoch(
+    train_loader, num_workers
+):
+    given = {"num_train": 56, "batch_size": 2, "num_points": 4, "reuse": 2, "takes": ("points", "crop")}
+    loader, other = (train_loader(**given, num_workers=number) for number in (0, num_workers))
+    batches_of(loader, 0, number=1)
+    for one, another in zip(*(batches_of(each, 1, number=28) for each in (loader, other))):
+        assert_same_bits(one, another)
+
+
+@pytest.mark.parametrize("num_workers", [0, 1, 3])
+def test_a_worker_finds_what_it_has_rendered(make_datamodule, num_workers):
+    datamodule = make_datamodule(num_train=60, batch_size=2, num_points=4, reuse=2)
+    datamodule.num_workers = num_workers  # played by hand: each of them gets every so-manyth batch
+    workers = max(1, num_workers)
+    synthesizer = datamodule._synthesizer("train")
+    rendered = []
+    render = synthesizer._render
+    synthesizer._render = lambda keys, with_depth: rendered.append(keys) or render(keys, with_depth)
+    batches = RepeatedBatches([[(0, 2 * i), (0, 2 * i + 1)] for i in range(24)], 2)
+    mine = list(batches)[::workers]
+    for keys in mine:
+        synthesizer.batch(keys)
+    assert len(rendered) == len(mine) / 2
+
+
+@pytest.mark.parametrize("reuse", [0, -1, 1.5])
+def test_an_impossible_number_of_uses_is_an_error(make_datamodule, reuse):
+    with pytest.raises(ValueError, match="reuse: expected a whole number of 1 or more, got"):
+        make_datamodule(reuse=reuse)
 
 
 # The distribution of the samples (section 3.5.2 and the specification of the camera and the placement)

@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 from ljn.geometry.rotations import (
     BODY_TO_OPENGL,
     CAMERA_FROM_BODY,
+    body_to_camera,
     euler_to_rotmat,
     interpolate_rotmat,
     rot6d_to_rotmat,
@@ -137,6 +138,12 @@ def test_body_axes_reach_opengl_and_opencv_cameras():
     opencv_from_opengl = torch.diag(torch.tensor([1, -1, -1], dtype=DTYPE))
     torch.testing.assert_close(CAMERA_FROM_BODY, opencv_from_opengl @ BODY_TO_OPENGL)
     assert torch.linalg.det(CAMERA_FROM_BODY).item() == pytest.approx(1)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_body_to_camera_equals_the_product(dtype):
+    points = random_rotvecs(4, 5, dtype=dtype)
+    assert torch.equal(body_to_camera(points), points @ CAMERA_FROM_BODY.to(dtype).T)
 
 
 def test_a_body_at_rest_in_smpl_axes_stands_along_z_and_faces_x_in_body_world():
