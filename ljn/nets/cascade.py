@@ -49,7 +49,7 @@ class PatchCascade(Detector):
         start: str = "either",
         patch_sizes_m: Sequence[float] = (0.5, 0.4, 0.32, 0.26),
         guess_size_m: float = 0.8,
-        keypoint_dropout: float = 0.5,
+        keypoint_dropout: float = 0.3,
         patch_scales: Sequence[float] = (1.0, 2.5),
         patch_px: int = 12,
         square_channels: int = 32,
