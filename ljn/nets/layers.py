@@ -52,6 +52,23 @@ def initialise(layer: LayerT, slope: float = 0.0, scale: float = 1.0) -> LayerT:
     return layer
 
 
+def shared_linear(layer: nn.Linear, points: Tensor, shared: Tensor | None) -> Tensor:
+    """`layer` on points whose last channels are the same all over a cloud: multiplied once a cloud, not once a point.
+
+    Args:
+        layer: Of `C + S` input channels.
+        points: `(B, N, C)`.
+        shared: `(B, S)`; None where S is 0.
+
+    Returns:
+        `(B, N, C')`, as of `layer` on `[points, shared]`, up to rounding.
+    """
+    if shared is None:
+        return layer(points)  # type: ignore[no-any-return]
+    of_points, of_shared = layer.weight.split([points.shape[-1], shared.shape[-1]], -1)
+    return points @ of_points.mT + functional.linear(shared, of_shared, layer.bias)[:, None]
+
+
 class StackedLinear(nn.Module):
     """One linear layer for each joint, run as one batched product, conditioned by `initialise` for a PReLU.
 

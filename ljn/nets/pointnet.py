@@ -1,11 +1,11 @@
 """PointNet (Qi et al. 2017; Fig. 3.2), without T-nets and batch normalisation, with PReLU."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 from torch import Tensor, nn
 
-from ljn.nets.layers import activate_and_pool, perceptron
+from ljn.nets.layers import activate_and_pool, perceptron, shared_linear
 
 
 class PointFeatures(NamedTuple):
@@ -41,11 +41,19 @@ class PointNet(nn.Module):
         self.lift_activation = nn.PReLU()
         self.out_channels = global_channels[-1]
 
-    def forward(self, points: Tensor) -> PointFeatures:
-        """`(B, N, in_channels)` -> `PointFeatures`; the global feature ignores the order of the points."""
-        local = self.local(points)
+    def forward(self, points: Tensor, shared: Tensor | None = None) -> PointFeatures:
+        """`PointFeatures`; the global feature ignores the order of the points.
+
+        Args:
+            points: `(B, N, in_channels)`, or without the last channels, which are `shared`.
+            shared: `(B, C)`, channels which all points of a cloud have in common.
+        """
+        first, *rest = self.local
+        local = shared_linear(cast(nn.Linear, first), points, shared)
+        for layer in rest:
+            local = layer(local)
         return PointFeatures(local, activate_and_pool(self.lift(local), self.lift_activation, 1))
 
-    def global_feature(self, points: Tensor) -> Tensor:
-        """`(B, N, in_channels)` -> `(B, out_channels)`, as `PointNet2.global_feature`."""
-        return self(points).pooled
+    def global_feature(self, points: Tensor, shared: Tensor | None = None) -> Tensor:
+        """The global feature `(B, out_channels)`, as `PointNet2.global_feature`; see `forward`."""
+        return self(points, shared).pooled

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from ljn.geometry.points import ball_group, farthest_point_sampling, gather_points
-from ljn.nets.layers import PRELU_SLOPE, activate_and_pool, initialise, perceptron
+from ljn.nets.layers import PRELU_SLOPE, activate_and_pool, initialise, perceptron, shared_linear
 
 
 class SetAbstraction(nn.Module):
@@ -54,12 +54,15 @@ class SetAbstraction(nn.Module):
         self.rest = perceptron(channels, last_activation=False)
         self.last_activation = nn.PReLU()
 
-    def forward(self, positions: Tensor, features: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(
+        self, positions: Tensor, features: Tensor, shared: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
         """Centres and their features.
 
         Args:
             positions: `(B, N, 3)`, metres.
-            features: `(B, N, in_channels)`.
+            features: `(B, N, in_channels)`, or without the last channels, which are `shared`.
+            shared: `(B, C)`, those which all points of a cloud have in common.
 
         Returns:
             Positions `(B, M, 3)` and features `(B, M, channels[-1])` of the centres.
@@ -69,7 +72,7 @@ class SetAbstraction(nn.Module):
         index = ball_group(positions, centres, radii, self.group_size)  # (B, M, n)
         # The first layer is linear in a point's position and feature: once for each point, not once for each
         # of its appearances in a ball; the ball's centre is taken off afterwards.
-        hidden = self.feature(features) + self.position(positions / self.unit_m)
+        hidden = shared_linear(self.feature, features, shared) + self.position(positions / self.unit_m)
         hidden = gather_points(hidden, index) - self.position(centres / self.unit_m)[:, :, None]
         hidden = self.rest(self.first_activation(hidden))  # (B, M, n, C)
         return centres, activate_and_pool(hidden, self.last_activation, 2)
@@ -122,13 +125,19 @@ class PointNet2(nn.Module):
         self.lift_activation = nn.PReLU()
         self.out_channels = global_channels[-1]
 
-    def forward(self, points: Tensor) -> Tensor:
-        """`(B, N, in_channels)`, position first, metres -> the global feature `(B, global_channels[-1])`."""
+    def forward(self, points: Tensor, shared: Tensor | None = None) -> Tensor:
+        """The global feature `(B, global_channels[-1])`.
+
+        Args:
+            points: `(B, N, in_channels)`, position first, metres; or without the last channels, which are `shared`.
+            shared: `(B, C)`, channels which all points of a cloud have in common.
+        """
         positions, features = points[..., :3], points
         for abstraction in self.abstractions:
-            positions, features = abstraction(positions, features)
+            positions, features = abstraction(positions, features, shared)
+            shared = None  # the centres' features hold it
         return activate_and_pool(self.lift(torch.cat([positions, features], -1)), self.lift_activation, 1)
 
-    def global_feature(self, points: Tensor) -> Tensor:
-        """`(B, N, in_channels)` -> `(B, out_channels)`, as `PointNet.global_feature`."""
-        return self(points)
+    def global_feature(self, points: Tensor, shared: Tensor | None = None) -> Tensor:
+        """The global feature `(B, out_channels)`, as `PointNet.global_feature`; see `forward`."""
+        return self(points, shared)
