@@ -1,7 +1,7 @@
 """Layers shared by the networks: point-wise perceptrons, alone and stacked over the joints."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from itertools import pairwise
 from typing import Any, TypeVar
 
@@ -52,21 +52,26 @@ def initialise(layer: LayerT, slope: float = 0.0, scale: float = 1.0) -> LayerT:
     return layer
 
 
-def shared_linear(layer: nn.Linear, points: Tensor, shared: Tensor | None) -> Tensor:
-    """`layer` on points whose last channels are the same all over a cloud: multiplied once a cloud, not once a point.
+def apply_shared(layers: Iterable[nn.Module], points: Tensor, shared: Tensor | None) -> Tensor:
+    """`layers` on points whose last channels are the same all over a cloud: multiplied once a cloud, not once a point.
 
     Args:
-        layer: Of `C + S` input channels.
+        layers: The first one linear, of `C + S` input channels.
         points: `(B, N, C)`.
         shared: `(B, S)`; None where S is 0.
 
     Returns:
-        `(B, N, C')`, as of `layer` on `[points, shared]`, up to rounding.
+        What comes of `[points, shared]`, up to rounding: `(B, N, C')`.
     """
+    first, *rest = layers
     if shared is None:
-        return layer(points)  # type: ignore[no-any-return]
-    of_points, of_shared = layer.weight.split([points.shape[-1], shared.shape[-1]], -1)
-    return points @ of_points.mT + functional.linear(shared, of_shared, layer.bias)[:, None]
+        hidden = first(points)
+    else:
+        of_points, of_shared = first.weight.split([points.shape[-1], shared.shape[-1]], -1)
+        hidden = points @ of_points.mT + functional.linear(shared, of_shared, first.bias)[:, None]
+    for layer in rest:
+        hidden = layer(hidden)
+    return hidden
 
 
 class StackedLinear(nn.Module):

@@ -13,8 +13,8 @@ from ljn.nets.pointnet2 import PointNet2
 CHANNELS = 6 + 72
 
 
-def pointnet2():
-    return PointNet2(CHANNELS, (12, 4), (0.3, 0.6), (8, 4), ((6, 8), (8, 10)), (8, 12))
+def pointnet2(**changes):
+    return PointNet2(CHANNELS, (12, 4), (0.3, 0.6), (8, 4), ((6, 8), (8, 10)), (8, 12), **changes)
 
 
 def hierarchical(trunk=None, **changes):
@@ -31,6 +31,10 @@ NETWORKS = {
     "single": lambda **changes: hierarchical(passes_ancestors=False, **changes),
     "pointnet": lambda **changes: hierarchical(PointNet(CHANNELS, (6, 6), (8, 10)), **changes),
     "basic": direct,
+    "carried": lambda **changes: hierarchical(pointnet2(carried_channels=72), **changes),
+    "carried on pointnet": lambda **changes: hierarchical(
+        PointNet(CHANNELS, (6, 6), (8, 10), carried_channels=72), **changes
+    ),
 }
 
 
@@ -90,12 +94,15 @@ def test_every_parameter_gets_a_gradient(make, rotation):
 WIDE = {
     "proposed": lambda: HierarchicalBodyNetwork(wide_pointnet2(), 3, "rotvec", (256,), (128, 128)),
     "pointnet": lambda: HierarchicalBodyNetwork(PointNet(CHANNELS, (64, 64), (64, 128, 256)), 3),
+    "carried": lambda: HierarchicalBodyNetwork(wide_pointnet2(72), 3, "rot6d", (256,), (128, 128)),
     "basic": lambda: DirectBodyNetwork(wide_pointnet2(), 3, "rotvec", (256,), (256, 256)),
 }
 
 
-def wide_pointnet2():
-    return PointNet2(CHANNELS, (64, 16), (0.2, 0.4), (16, 16), ((64, 64), (64, 128)), (128, 256))
+def wide_pointnet2(carried=None):
+    return PointNet2(
+        CHANNELS, (64, 16), (0.2, 0.4), (16, 16), ((64, 64), (64, 128)), (128, 256), carried_channels=carried
+    )
 
 
 def observed_bodies(size=16, num_points=256):
@@ -132,8 +139,9 @@ def test_at_the_start_all_hidden_layers_are_heard_and_residuals_are_small(name):
     assert betas.abs().mean() < 0.5
 
 
-def test_every_point_carries_the_initial_joints(make):
-    net, (points, joints) = randomised(make()), batch()
+@pytest.mark.parametrize("name", ["proposed", "pointnet"])
+def test_every_point_carries_the_initial_joints(name):
+    net, (points, joints) = randomised(NETWORKS[name]()), batch()
     offsets = joints - joints[:, :1]
     carried = offsets.flatten(1)[:, None].expand(-1, points.shape[1], -1)
     centred = torch.cat([points[..., :3] - joints[:, :1], points[..., 3:]], -1)

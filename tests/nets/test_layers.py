@@ -5,8 +5,8 @@ from torch import nn
 from ljn.nets.layers import (
     StackedPReLU,
     activate_and_pool,
+    apply_shared,
     perceptron,
-    shared_linear,
     stacked_perceptron,
 )
 
@@ -51,8 +51,8 @@ def test_activating_after_pooling_handles_slopes_of_both_signs_among_joints():
 
 def test_what_all_points_share_is_as_if_each_point_carried_it():
     torch.manual_seed(0)
-    layer = nn.Linear(7, 5).double()
+    layers = perceptron([7, 5, 3]).double()
     points, shared = torch.randn(2, 4, 3, dtype=torch.float64), torch.randn(2, 4, dtype=torch.float64)
     carried = torch.cat([points, shared[:, None].expand(-1, 4, -1)], -1)
-    torch.testing.assert_close(shared_linear(layer, points, shared), layer(carried))
-    torch.testing.assert_close(shared_linear(layer, carried, None), layer(carried))
+    torch.testing.assert_close(apply_shared(layers, points, shared), layers(carried))
+    torch.testing.assert_close(apply_shared(layers, carried, None), layers(carried))
