@@ -3,7 +3,7 @@
 import math
 from collections.abc import Iterable, Sequence
 from itertools import pairwise
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import torch
 from torch import Tensor, nn
@@ -67,8 +67,9 @@ def apply_shared(layers: Iterable[nn.Module], points: Tensor, shared: Tensor | N
     if shared is None:
         hidden = first(points)
     else:
-        of_points, of_shared = first.weight.split([points.shape[-1], shared.shape[-1]], -1)
-        hidden = points @ of_points.mT + functional.linear(shared, of_shared, first.bias)[:, None]
+        linear = cast(nn.Linear, first)
+        of_points, of_shared = linear.weight.split([points.shape[-1], shared.shape[-1]], -1)
+        hidden = points @ of_points.mT + functional.linear(shared, of_shared, linear.bias)[:, None]
     for layer in rest:
         hidden = layer(hidden)
     return hidden

@@ -78,7 +78,8 @@ def test_every_network_composes_with_every_preset(preset, compose_config, tmp_pa
     for experiment in ("detector/proposed", "detector/basic", "mesh/proposed", "mesh/basic", "mesh/pointnet"):
         cfg = compose_config(f"preset={preset}", f"experiment={experiment}", f"paths.output_dir={tmp_path}")
         validate(cfg)
-        assert cfg.module.optimizer.lr == cfg.preset.learning_rate
+        of_stage = cfg.preset.mesh if experiment.startswith("mesh") else cfg.preset
+        assert cfg.module.optimizer.lr == of_stage.learning_rate
 
 
 def test_the_thesis_figures_in_comments_are_those_of_the_tables():
