@@ -107,8 +107,8 @@ class CloudBodyNetwork(BodyNetwork):
     def feature(self, points: Tensor, initial_joints: Tensor) -> Tensor:
         """The cloud's global feature `(B, C)`, all centred on the initial root; arguments as in a call."""
         root = initial_joints[:, ROOT, None]
-        joints = (initial_joints - root).flatten(1)[:, None].expand(-1, points.shape[1], -1)
-        return self.trunk.global_feature(torch.cat([points[..., :3] - root, points[..., 3:], joints], -1))
+        joints = (initial_joints - root).flatten(1)  # of every point, hence once a cloud
+        return self.trunk.global_feature(torch.cat([points[..., :3] - root, points[..., 3:]], -1), joints)
 
     @abstractmethod
     def refine(self, feature: Tensor, pose: Tensor, betas: Tensor) -> "list[tuple[Tensor, Tensor]]":

@@ -1,9 +1,9 @@
 """Layers shared by the networks: point-wise perceptrons, alone and stacked over the joints."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from itertools import pairwise
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import torch
 from torch import Tensor, nn
@@ -54,6 +54,29 @@ def initialise(layer: LayerT, slope: float = 0.0, scale: float = 1.0, fan_in: in
     if layer.bias is not None:
         nn.init.zeros_(layer.bias)
     return layer
+
+
+def apply_shared(layers: Iterable[nn.Module], points: Tensor, shared: Tensor | None) -> Tensor:
+    """`layers` on points whose last channels are the same all over a cloud: multiplied once a cloud, not once a point.
+
+    Args:
+        layers: The first one linear, of `C + S` input channels.
+        points: `(B, N, C)`.
+        shared: `(B, S)`; None where S is 0.
+
+    Returns:
+        What comes of `[points, shared]`, up to rounding: `(B, N, C')`.
+    """
+    first, *rest = layers
+    if shared is None:
+        hidden = first(points)
+    else:
+        linear = cast(nn.Linear, first)
+        of_points, of_shared = linear.weight.split([points.shape[-1], shared.shape[-1]], -1)
+        hidden = points @ of_points.mT + functional.linear(shared, of_shared, linear.bias)[:, None]
+    for layer in rest:
+        hidden = layer(hidden)
+    return hidden
 
 
 class StackedLinear(nn.Module):

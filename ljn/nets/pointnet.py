@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 from torch import Tensor, nn
 
-from ljn.nets.layers import activate_and_pool, perceptron
+from ljn.nets.layers import activate_and_pool, apply_shared, perceptron
 
 
 class PointFeatures(NamedTuple):
@@ -27,6 +27,8 @@ class PointNet(nn.Module):
         in_channels: Channels of a point.
         local_channels: Widths up to the local feature.
         global_channels: Widths from there to the global feature.
+        carried_channels: How many channels, which all points of a cloud share, are given beside the local features,
+            too; None: they reach the global feature through those alone.
     """
 
     def __init__(
@@ -34,18 +36,29 @@ class PointNet(nn.Module):
         in_channels: int = 6,
         local_channels: Sequence[int] = (64, 64),
         global_channels: Sequence[int] = (64, 128, 1024),
+        carried_channels: int | None = None,
     ) -> None:
         super().__init__()
         self.local = perceptron([in_channels, *local_channels])
-        self.lift = perceptron([local_channels[-1], *global_channels], last_activation=False)
+        self.carried_channels = carried_channels or 0
+        self.lift = perceptron(
+            [local_channels[-1] + self.carried_channels, *global_channels], last_activation=False
+        )
         self.lift_activation = nn.PReLU()
         self.out_channels = global_channels[-1]
 
-    def forward(self, points: Tensor) -> PointFeatures:
-        """`(B, N, in_channels)` -> `PointFeatures`; the global feature ignores the order of the points."""
-        local = self.local(points)
-        return PointFeatures(local, activate_and_pool(self.lift(local), self.lift_activation, 1))
+    def forward(self, points: Tensor, shared: Tensor | None = None) -> PointFeatures:
+        """`PointFeatures`; the global feature ignores the order of the points.
 
-    def global_feature(self, points: Tensor) -> Tensor:
-        """`(B, N, in_channels)` -> `(B, out_channels)`, as `PointNet2.global_feature`."""
-        return self(points).pooled
+        Args:
+            points: `(B, N, in_channels)`, or without the last channels, which are `shared`.
+            shared: `(B, C)`, channels which all points of a cloud have in common; C is `carried_channels` unless
+                that is None.
+        """
+        local = apply_shared(self.local, points, shared)
+        hidden = apply_shared(self.lift, local, shared if self.carried_channels else None)
+        return PointFeatures(local, activate_and_pool(hidden, self.lift_activation, 1))
+
+    def global_feature(self, points: Tensor, shared: Tensor | None = None) -> Tensor:
+        """The global feature `(B, out_channels)`, as `PointNet2.global_feature`; see `forward`."""
+        return self(points, shared).pooled

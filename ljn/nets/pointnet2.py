@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from ljn.geometry.points import ball_group, farthest_point_sampling, gather_points
-from ljn.nets.layers import PRELU_SLOPE, activate_and_pool, initialise, perceptron
+from ljn.nets.layers import PRELU_SLOPE, activate_and_pool, apply_shared, initialise, perceptron
 
 
 class SetAbstraction(nn.Module):
@@ -50,12 +50,15 @@ class SetAbstraction(nn.Module):
         self.rest = perceptron(channels, last_activation=False)
         self.last_activation = nn.PReLU()
 
-    def forward(self, positions: Tensor, features: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(
+        self, positions: Tensor, features: Tensor, shared: Tensor | None = None
+    ) -> tuple[Tensor, Tensor]:
         """Centres and their features.
 
         Args:
             positions: `(B, N, 3)`, metres.
-            features: `(B, N, in_channels)`.
+            features: `(B, N, in_channels)`, or without the last channels, which are `shared`.
+            shared: `(B, C)`, those which all points of a cloud have in common.
 
         Returns:
             Positions `(B, M, 3)` and features `(B, M, channels[-1])` of the centres.
@@ -65,7 +68,7 @@ class SetAbstraction(nn.Module):
         index = ball_group(positions, centres, radii, self.group_size)  # (B, M, n)
         # The first layer is linear in a point's position and feature: once for each point, not once for each
         # of its appearances in a ball; the ball's centre is taken off afterwards.
-        hidden = self.feature(features) + self.position(positions / self.unit_m)
+        hidden = apply_shared([self.feature], features, shared) + self.position(positions / self.unit_m)
         hidden = gather_points(hidden, index) - self.position(centres / self.unit_m)[:, :, None]
         hidden = self.rest(self.first_activation(hidden))  # (B, M, n, C)
         return centres, activate_and_pool(hidden, self.last_activation, 2)
@@ -85,6 +88,8 @@ class PointNet2(nn.Module):
         channels: Their widths.
         global_channels: Widths of the last PointNet, up to the global feature.
         relative_to_radius: See `SetAbstraction`.
+        carried_channels: How many channels, which all points of a cloud share, the last centres carry beside their
+            features, as the points do; None: they reach the global feature through the points alone.
 
     Raises:
         ValueError: The lists differ in length, or a number of centres or points is less than 1.
@@ -99,6 +104,7 @@ class PointNet2(nn.Module):
         channels: Sequence[Sequence[int]] = ((64, 64, 128), (128, 128, 256)),
         global_channels: Sequence[int] = (256, 512, 1024),
         relative_to_radius: bool = True,
+        carried_channels: int | None = None,
     ) -> None:
         super().__init__()
         lengths = {len(num_centres), len(radii_m), len(group_sizes), len(channels)}
@@ -114,17 +120,28 @@ class PointNet2(nn.Module):
                 num_centres, radii_m, group_sizes, widths, channels
             )
         )
-        self.lift = perceptron([3 + widths[-1], *global_channels], last_activation=False)
+        self.carried_channels = carried_channels or 0
+        self.lift = perceptron(
+            [3 + widths[-1] + self.carried_channels, *global_channels], last_activation=False
+        )
         self.lift_activation = nn.PReLU()
         self.out_channels = global_channels[-1]
 
-    def forward(self, points: Tensor) -> Tensor:
-        """`(B, N, in_channels)`, position first, metres -> the global feature `(B, global_channels[-1])`."""
-        positions, features = points[..., :3], points
-        for abstraction in self.abstractions:
-            positions, features = abstraction(positions, features)
-        return activate_and_pool(self.lift(torch.cat([positions, features], -1)), self.lift_activation, 1)
+    def forward(self, points: Tensor, shared: Tensor | None = None) -> Tensor:
+        """The global feature `(B, global_channels[-1])`.
 
-    def global_feature(self, points: Tensor) -> Tensor:
-        """`(B, N, in_channels)` -> `(B, out_channels)`, as `PointNet.global_feature`."""
-        return self(points)
+        Args:
+            points: `(B, N, in_channels)`, position first, metres; or without the last channels, which are `shared`.
+            shared: `(B, C)`, channels which all points of a cloud have in common; C is `carried_channels` unless
+                that is None.
+        """
+        positions, features = points[..., :3], points
+        for number, abstraction in enumerate(self.abstractions):
+            positions, features = abstraction(positions, features, None if number else shared)
+        carried = shared if self.carried_channels else None
+        hidden = apply_shared(self.lift, torch.cat([positions, features], -1), carried)
+        return activate_and_pool(hidden, self.lift_activation, 1)
+
+    def global_feature(self, points: Tensor, shared: Tensor | None = None) -> Tensor:
+        """The global feature `(B, out_channels)`, as `PointNet.global_feature`; see `forward`."""
+        return self(points, shared)

@@ -116,7 +116,8 @@ def _check_learning_rate(plain: dict[str, Any]) -> None:
     rate = _group(plain, "module.optimizer").get("lr", 1)
     if not (type(rate) in (int, float) and 0 < rate < math.inf):
         raise ValueError(
-            f"module.optimizer.lr: expected a positive finite number, got {rate!r}; set preset.learning_rate=1e-3"
+            f"module.optimizer.lr: expected a positive finite number, got {rate!r}; set preset.learning_rate=1e-3 "
+            "(of a mesh regressor: preset.mesh.learning_rate=1e-3)"
         )
 
 

@@ -1,18 +1,20 @@
 import pytest
 import torch
+from torch import nn
 from torch.nn import functional
 
 from ljn.body.skeleton import JOINT_INDEX, JOINT_NAMES, LEVELS, PARENTS
 from ljn.geometry.rotations import BODY_TO_OPENGL
 from ljn.nets.body_network import DirectBodyNetwork, HierarchicalBodyNetwork
+from ljn.nets.layers import StackedPReLU
 from ljn.nets.pointnet import PointNet
 from ljn.nets.pointnet2 import PointNet2
 
 CHANNELS = 6 + 72
 
 
-def pointnet2():
-    return PointNet2(CHANNELS, (12, 4), (0.3, 0.6), (8, 4), ((6, 8), (8, 10)), (8, 12))
+def pointnet2(**changes):
+    return PointNet2(CHANNELS, (12, 4), (0.3, 0.6), (8, 4), ((6, 8), (8, 10)), (8, 12), **changes)
 
 
 def hierarchical(trunk=None, **changes):
@@ -29,6 +31,10 @@ NETWORKS = {
     "single": lambda **changes: hierarchical(passes_ancestors=False, **changes),
     "pointnet": lambda **changes: hierarchical(PointNet(CHANNELS, (6, 6), (8, 10)), **changes),
     "basic": direct,
+    "carried": lambda **changes: hierarchical(pointnet2(carried_channels=72), **changes),
+    "carried on pointnet": lambda **changes: hierarchical(
+        PointNet(CHANNELS, (6, 6), (8, 10), carried_channels=72), **changes
+    ),
 }
 
 
@@ -83,6 +89,64 @@ def test_every_parameter_gets_a_gradient(make, rotation):
     weights = torch.randn(rotmats.shape, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
     ((rotmats * weights).sum() + betas.square().sum()).backward()
     assert [name for name, p in net.named_parameters() if p.grad is None or not p.grad.any()] == []
+
+
+WIDE = {
+    "proposed": lambda: HierarchicalBodyNetwork(wide_pointnet2(), 3, "rotvec", (256,), (128, 128)),
+    "pointnet": lambda: HierarchicalBodyNetwork(PointNet(CHANNELS, (64, 64), (64, 128, 256)), 3),
+    "carried": lambda: HierarchicalBodyNetwork(wide_pointnet2(72), 3, "rot6d", (256,), (128, 128)),
+    "basic": lambda: DirectBodyNetwork(wide_pointnet2(), 3, "rotvec", (256,), (256, 256)),
+}
+
+
+def wide_pointnet2(carried=None):
+    return PointNet2(
+        CHANNELS, (64, 16), (0.2, 0.4), (16, 16), ((64, 64), (64, 128)), (128, 256), carried_channels=carried
+    )
+
+
+def observed_bodies(size=16, num_points=256):
+    """Points on ellipsoids of a body's size with their normals, 2.5 m away, and joints inside."""
+    generator = torch.Generator().manual_seed(1)
+    axes = torch.tensor([0.3, 0.8, 0.2])
+    directions = functional.normalize(torch.randn(size, num_points, 3, generator=generator), dim=-1)
+    normals = functional.normalize(directions / axes, dim=-1)
+    joints = 0.6 * axes * torch.randn(size, 24, 3, generator=generator)
+    away = torch.tensor([0.0, 0.0, 2.5])
+    return torch.cat([axes * directions + away, normals], -1), joints + away
+
+
+@pytest.mark.parametrize("name", WIDE)
+def test_at_the_start_all_hidden_layers_are_heard_and_residuals_are_small(name):
+    torch.manual_seed(0)
+    net = WIDE[name]()
+    spreads = {}
+    for layer, module in net.named_modules():
+        if isinstance(module, nn.PReLU | StackedPReLU):
+            module.register_forward_hook(
+                lambda _, __, out, layer=layer: spreads.setdefault(layer, []).append(float(out.std()))
+            )
+    with torch.no_grad():
+        rotmats, betas = net(*observed_bodies())
+    values = [value for layer in spreads.values() for value in layer]
+    assert max(values) < 2 * min(values), spreads
+
+    mean = torch.eye(3).repeat(24, 1, 1)
+    mean[0] = BODY_TO_OPENGL.T
+    turns = torch.stack([rotmats[0] - mean, *rotmats.diff(dim=0)])  # (T, B, 24, 3, 3)
+    assert turns.flatten(-2).norm(dim=-1).mean((1, 2)).max() < 0.5  # of 2.8 for half a turn
+    assert turns.abs().max() > 0
+    assert betas.abs().mean() < 0.5
+
+
+@pytest.mark.parametrize("name", ["proposed", "pointnet"])
+def test_every_point_carries_the_initial_joints(name):
+    net, (points, joints) = randomised(NETWORKS[name]()), batch()
+    offsets = joints - joints[:, :1]
+    carried = offsets.flatten(1)[:, None].expand(-1, points.shape[1], -1)
+    centred = torch.cat([points[..., :3] - joints[:, :1], points[..., 3:]], -1)
+    expected = net.trunk.global_feature(torch.cat([centred, carried], -1))
+    torch.testing.assert_close(net.feature(points, joints), expected)
 
 
 def test_where_the_person_stands_does_not_matter(make):

@@ -2,7 +2,13 @@ import pytest
 import torch
 from torch import nn
 
-from ljn.nets.layers import StackedPReLU, activate_and_pool, perceptron, stacked_perceptron
+from ljn.nets.layers import (
+    StackedPReLU,
+    activate_and_pool,
+    apply_shared,
+    perceptron,
+    stacked_perceptron,
+)
 
 
 def test_stacked_layers_equal_a_loop_over_the_joints():
@@ -41,3 +47,12 @@ def test_activating_after_pooling_handles_slopes_of_both_signs_among_joints():
     activation.weight.data = torch.tensor([0.3, -0.4, 2.0])
     x = torch.randn(3, 4, 9, 6)
     torch.testing.assert_close(activate_and_pool(x, activation, 2), activation(x).amax(2))
+
+
+def test_what_all_points_share_is_as_if_each_point_carried_it():
+    torch.manual_seed(0)
+    layers = perceptron([7, 5, 3]).double()
+    points, shared = torch.randn(2, 4, 3, dtype=torch.float64), torch.randn(2, 4, dtype=torch.float64)
+    carried = torch.cat([points, shared[:, None].expand(-1, 4, -1)], -1)
+    torch.testing.assert_close(apply_shared(layers, points, shared), layers(carried))
+    torch.testing.assert_close(apply_shared(layers, carried, None), layers(carried))

@@ -77,3 +77,16 @@ def test_impossible_sizes_are_refused(changes, message, make):
         make(**changes)
     with pytest.raises(ValueError, match="num_samples: expected 1 to 8, the number of points, got 16"):
         make()(cloud(num_points=8))
+
+
+@pytest.mark.parametrize("carried", [None, 4])
+def test_the_last_centres_carry_what_all_points_share_only_where_they_are_to(make, carried):
+    net, points = make(in_channels=10, carried_channels=carried), cloud(channels=10)
+    points[..., 6:] = points[:, :1, 6:]
+    positions, features = points[..., :3], points
+    for abstraction in net.abstractions:
+        positions, features = abstraction(positions, features)
+    if carried:
+        features = torch.cat([features, points[:, : positions.shape[1], 6:]], -1)
+    lifted = net.lift(torch.cat([positions, features], -1))
+    torch.testing.assert_close(net(points[..., :6], points[:, 0, 6:]), net.lift_activation(lifted).amax(1))

@@ -78,7 +78,8 @@ def test_every_network_composes_with_every_preset(preset, compose_config, tmp_pa
     for experiment in ("detector/proposed", "detector/basic", "mesh/proposed", "mesh/basic", "mesh/pointnet"):
         cfg = compose_config(f"preset={preset}", f"experiment={experiment}", f"paths.output_dir={tmp_path}")
         validate(cfg)
-        assert cfg.module.optimizer.lr == cfg.preset.learning_rate
+        of_stage = cfg.preset.mesh if experiment.startswith("mesh") else cfg.preset
+        assert cfg.module.optimizer.lr == of_stage.learning_rate
 
 
 def test_the_thesis_figures_in_comments_are_those_of_the_tables():
@@ -108,10 +109,29 @@ def test_the_thesis_preset_holds_the_specs_numbers(compose_config):
     assert cfg.module.optimizer._target_ == "torch.optim.RAdam"
     assert (cfg.module.scheduler.step_size, cfg.module.scheduler.gamma) == (5, 0.1)
     assert cfg.data.observation.normals == "knn"
-    mesh = compose_config("preset=thesis", "experiment=mesh/proposed").model
+    cfg = compose_config("preset=thesis", "experiment=mesh/proposed")
+    mesh, module = cfg.model, cfg.module
     assert (mesh.trunk.num_centres, mesh.trunk.group_sizes) == ([512, 128], [32, 64])
     assert mesh.trunk.channels == [[64, 64, 128], [128, 128, 256]]
     assert mesh.trunk.global_channels == [256, 512, 1024]
+    assert (mesh.trunk.carried_channels, mesh.rotation, cfg.data.batch_size) == (None, "rotvec", 16)
+    assert (module.optimizer._target_, module.optimizer.lr) == ("torch.optim.RAdam", 1e-3)
+    assert (module.loss, module.loss_vertices, module.joint_weight) == ("squared", None, 0)
+    pointnet = compose_config("preset=thesis", "experiment=mesh/pointnet").model.trunk
+    assert (pointnet.local_channels, pointnet.global_channels) == ([64, 64], [64, 128, 1024])
+
+
+@pytest.mark.parametrize("preset", ["thesis", "small"])
+def test_the_rows_of_the_mesh_regressors_share_one_protocol(preset, compose_config):
+    rows = [
+        compose_config(f"preset={preset}", f"experiment=mesh/{name}")
+        for name in ("proposed", "single", "pointnet", "basic")
+    ]
+    for row in rows[1:]:
+        assert row.data == rows[0].data
+        for key in ("loss", "loss_vertices", "joint_weight", "optimizer", "scheduler"):
+            assert row.module[key] == rows[0].module[key]
+        assert row.model.rotation == rows[0].model.rotation
 
 
 @pytest.mark.parametrize(("override", "name"), [("data.num_pionts=3", "num_pionts"), ("seed=many", "seed")])
