@@ -2,12 +2,11 @@
 
 from collections.abc import Sequence
 
-import torch
 from torch import Tensor
 
 from ljn.body.skeleton import NUM_JOINTS
 from ljn.nets.detector import CloudDetector
-from ljn.nets.layers import OUTPUT_SCALE, perceptron
+from ljn.nets.layers import OUTPUT_SCALE, PRELU_SLOPE, initialise, perceptron
 from ljn.nets.pointnet import PointNet
 
 
@@ -32,6 +31,7 @@ class BasicDetector(CloudDetector):
     ) -> None:
         super().__init__(output)
         self.trunk = PointNet(in_channels + 3 * NUM_JOINTS, local_channels, global_channels)
+        initialise(self.trunk.local[0], PRELU_SLOPE, parts=(in_channels, 3 * NUM_JOINTS))
         self.head = perceptron(
             [global_channels[-1], *head_channels, 3 * NUM_JOINTS],
             last_activation=False,
@@ -40,6 +40,5 @@ class BasicDetector(CloudDetector):
 
     def regress(self, points: Tensor, initial_joints: Tensor) -> Tensor:
         """See `CloudDetector.regress`."""
-        coordinates = initial_joints.flatten(1)[:, None].expand(-1, points.shape[1], -1)
-        features = self.trunk(torch.cat([points, coordinates], -1))
+        features = self.trunk(points, initial_joints.flatten(1))
         return self.head(features.pooled).unflatten(-1, (NUM_JOINTS, 3))

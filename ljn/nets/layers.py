@@ -9,6 +9,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from ljn.geometry.points import gather_points
+
 LayerT = TypeVar("LayerT", bound=Any)
 
 
@@ -35,19 +37,27 @@ def perceptron(
     return nn.Sequential(*layers)
 
 
-def initialise(layer: LayerT, slope: float = 0.0, scale: float = 1.0) -> LayerT:
+def initialise(layer: LayerT, slope: float = 0.0, scale: float = 1.0, parts: Sequence[int] = ()) -> LayerT:
     """Kaiming's initialisation: what comes out is as large as what went in, after a (leaky) ReLU of `slope`.
 
     Args:
         layer: With `weight` `(out, in)`, `(K, out, in)` or `(out, in, kh, kw)`, and `bias`, which becomes zero.
         slope: Of the activation on its negative side: 0.25 for a PReLU, 0 for ReLU and GELU.
         scale: Factor of the weights; a small one for last layers, which then start near their bias.
+        parts: Channels of each part of the input, where it has several: each has the same say at first. A
+            point's three coordinates would count for nothing beside hundreds of channels of a global feature.
 
     Returns:
         The layer.
     """
     fan_in = layer.weight[0].numel() if layer.weight.ndim == 4 else layer.weight.shape[-1]
-    nn.init.normal_(layer.weight, 0.0, scale * math.sqrt(2 / (1 + slope**2) / fan_in))
+    parts = parts or [fan_in]
+    gains = [scale * math.sqrt(2 / (1 + slope**2) / (width * len(parts))) for width in parts]
+    if len(parts) == 1:
+        nn.init.normal_(layer.weight, 0.0, gains[0])
+    else:
+        for weight, gain in zip(layer.weight.split(list(parts), -1), gains, strict=True):
+            nn.init.normal_(weight, 0.0, gain)
     nn.init.zeros_(layer.bias)
     return layer
 
@@ -108,3 +118,28 @@ def activate_and_pool(x: Tensor, activation: nn.PReLU | StackedPReLU, dim: int) 
     if bool((activation.weight < 0).any()):
         pooled = torch.maximum(pooled, activation(x.min(dim).values))
     return pooled
+
+
+def perceive_and_pool(mlp: nn.Sequential, activation: nn.PReLU, points: Tensor) -> Tensor:
+    """`activate_and_pool(mlp(points), activation, 1)`, gradients passing through few points alone.
+
+    A channel's maximum is one point's value; the other points' gradients are zero. A first pass without gradients
+    finds one point for each of C channels, and a second one goes through these: a half of the work where there
+    are many more points.
+
+    Args:
+        mlp: A `perceptron` without its last activation.
+        activation: The last activation.
+        points: `(B, N, C_in)`.
+
+    Returns:
+        `(B, C)`.
+    """
+    last = mlp[-1]
+    is_dense = not torch.is_grad_enabled() or 2 * last.out_features > points.shape[1]
+    if is_dense or bool((activation.weight < 0).any()):
+        return activate_and_pool(mlp(points), activation, 1)
+    with torch.no_grad():
+        index = mlp(points).argmax(1)  # (B, C)
+    hidden = mlp[:-1](gather_points(points, index))  # (B, C, C_hidden): row c for channel c
+    return activation((hidden * last.weight).sum(-1) + last.bias)

@@ -3,9 +3,11 @@
 from collections.abc import Sequence
 from typing import NamedTuple
 
+import torch
 from torch import Tensor, nn
+from torch.nn import functional
 
-from ljn.nets.layers import activate_and_pool, perceptron
+from ljn.nets.layers import perceive_and_pool, perceptron
 
 
 class PointFeatures(NamedTuple):
@@ -41,10 +43,26 @@ class PointNet(nn.Module):
         self.lift_activation = nn.PReLU()
         self.out_channels = global_channels[-1]
 
-    def forward(self, points: Tensor) -> PointFeatures:
-        """`(B, N, in_channels)` -> `PointFeatures`; the global feature ignores the order of the points."""
-        local = self.local(points)
-        return PointFeatures(local, activate_and_pool(self.lift(local), self.lift_activation, 1))
+    def forward(self, points: Tensor, shared: Tensor | None = None) -> PointFeatures:
+        """Features of a cloud; the global one ignores the order of the points.
+
+        Args:
+            points: `(B, N, C)`.
+            shared: `(B, in_channels - C)`, what every point of a cloud carries after its own channels; it is
+                multiplied once for the cloud, not once for each point: the same sum, a part of the work.
+        """
+        if shared is None:
+            local = self.local(points)
+        else:
+            first = self.local[0]
+            own_weight, shared_weight = first.weight.split([points.shape[-1], shared.shape[-1]], -1)
+            hidden = torch.baddbmm(
+                functional.linear(shared, shared_weight, first.bias)[:, None],
+                points,
+                own_weight.T.expand(len(points), -1, -1),
+            )
+            local = self.local[1:](hidden)
+        return PointFeatures(local, perceive_and_pool(self.lift, self.lift_activation, local))
 
     def global_feature(self, points: Tensor) -> Tensor:
         """`(B, N, in_channels)` -> `(B, out_channels)`, as `PointNet2.global_feature`."""

@@ -1,8 +1,13 @@
+import itertools
+
 import pytest
 import torch
+from torch import nn
 
 from ljn.nets.basic_detector import BasicDetector
 from ljn.nets.joint_network import LocalJointNetwork
+from ljn.nets.layers import StackedLinear, StackedPReLU
+from ljn.nets.simple_baseline import SimpleBaseline
 from ljn.nets.yardsticks import MeanOffset, Ridge
 
 SIZES = {"local_channels": (6, 6), "global_channels": (6, 8, 10), "head_channels": (8, 6)}
@@ -82,6 +87,72 @@ def test_a_few_samples_can_be_overfitted(make, output):
         loss.backward()
         optimizer.step()
     assert loss < 0.02 * 24 * 3 * 0.1**2
+
+
+SMALL = {"local_channels": (32, 32), "global_channels": (32, 64, 128), "head_channels": (128, 64)}
+THESIS = {
+    "proposed": lambda: LocalJointNetwork(RADII),
+    "proposed, small": lambda: LocalJointNetwork(RADII, 64, group_channels=(32, 64, 128), **SMALL),
+    "no_edm": lambda: LocalJointNetwork(RADII, edm=False),
+    "basic": BasicDetector,
+    "basic, small": lambda: BasicDetector(**SMALL),
+    "simple_baseline": SimpleBaseline,
+}
+
+
+def people(size=4, num_points=512):
+    """Initial joints spread as a person's, points and normals around them."""
+    generator = torch.Generator().manual_seed(1)
+    joints = torch.randn(size, 24, 3, generator=generator) * torch.tensor([0.25, 0.45, 0.15])
+    joints += torch.tensor([0.3, 0.1, 2.2])
+    points = joints.repeat(1, -(-num_points // 24), 1)[:, :num_points]
+    points = points + 0.08 * torch.randn(points.shape, generator=generator)
+    normals = nn.functional.normalize(torch.randn(points.shape, generator=generator), dim=-1)
+    return torch.cat([points, normals], -1), joints
+
+
+def spreads_at_the_start(net):
+    """Spread of the centred input, of each activation's output in turn, and of the predicted offsets."""
+    spreads = []
+
+    def measure(module, inputs, output):
+        spreads.append(float(output.detach().std()))
+
+    for module in net.modules():
+        if isinstance(module, nn.PReLU | StackedPReLU | nn.ReLU):
+            module.register_forward_hook(measure)
+    points, joints = people()
+    with torch.no_grad():
+        pred = net(*(points, joints) if "points" in net.takes else (joints,))
+    start = joints[:, :1] if net.is_root_relative else joints
+    given = torch.cat([points[..., :3] - points[..., :3].mean(1, keepdim=True), points[..., 3:]], -1)
+    return float(given.std()), spreads, float((pred - start).square().sum(-1).mean().sqrt())
+
+
+def is_well_conditioned(net):
+    given, spreads, offset = spreads_at_the_start(net)
+    ratios = [after / before for before, after in itertools.pairwise([given, *spreads])]
+    return all(1 / 2 < ratio < 2 for ratio in ratios) and 1 / 3 < spreads[-1] / given < 3 and offset < 0.5
+
+
+@pytest.mark.parametrize("name", THESIS)
+def test_at_the_start_no_layer_drowns_or_blows_up_its_input_and_offsets_are_small(name):
+    torch.manual_seed(0)
+    assert is_well_conditioned(THESIS[name]())
+
+
+@pytest.mark.parametrize("name", THESIS)
+def test_with_the_default_initialisation_of_pytorch_they_would(name):
+    torch.manual_seed(0)
+    net = THESIS[name]()
+    for module in net.modules():
+        if isinstance(module, nn.Linear):
+            module.reset_parameters()
+        elif isinstance(module, StackedLinear):
+            bound = module.weight.shape[-1] ** -0.5
+            nn.init.uniform_(module.weight, -bound, bound)
+            nn.init.uniform_(module.bias, -bound, bound)
+    assert not is_well_conditioned(net)
 
 
 def of_joint(layer, joint, x):

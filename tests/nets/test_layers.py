@@ -2,7 +2,14 @@ import pytest
 import torch
 from torch import nn
 
-from ljn.nets.layers import StackedPReLU, activate_and_pool, perceptron, stacked_perceptron
+from ljn.nets.layers import (
+    StackedPReLU,
+    activate_and_pool,
+    initialise,
+    perceive_and_pool,
+    perceptron,
+    stacked_perceptron,
+)
 
 
 def test_stacked_layers_equal_a_loop_over_the_joints():
@@ -41,3 +48,30 @@ def test_activating_after_pooling_handles_slopes_of_both_signs_among_joints():
     activation.weight.data = torch.tensor([0.3, -0.4, 2.0])
     x = torch.randn(3, 4, 9, 6)
     torch.testing.assert_close(activate_and_pool(x, activation, 2), activation(x).amax(2))
+
+
+@pytest.mark.parametrize("out_features", [4, 8])
+def test_perceiving_and_pooling_through_few_points_equals_pooling_all(out_features):
+    torch.manual_seed(0)
+    mlp = perceptron([3, 5, out_features], last_activation=False).double()
+    for slope in (0.25, -0.3):
+        activation = nn.PReLU(init=slope).double()
+        x = torch.randn(2, 17, 3, dtype=torch.float64, requires_grad=True)
+        pooled = perceive_and_pool(mlp, activation, x)
+        reference = activation(mlp(x)).amax(1)
+        torch.testing.assert_close(pooled, reference)
+        weight = torch.randn_like(reference)
+        inputs = [x, *mlp.parameters(), activation.weight]
+        torch.testing.assert_close(
+            torch.autograd.grad((pooled * weight).sum(), inputs, materialize_grads=True),
+            torch.autograd.grad((reference * weight).sum(), inputs, materialize_grads=True),
+        )
+        with torch.no_grad():
+            torch.testing.assert_close(perceive_and_pool(mlp, activation, x), reference)
+
+
+def test_a_layer_of_several_parts_starts_with_the_same_say_for_each():
+    torch.manual_seed(0)
+    layer = initialise(nn.Linear(303, 4000), slope=0.25, parts=(3, 300))
+    says = [part.square().sum(-1).mean() for part in layer.weight.detach().split([3, 300], -1)]
+    torch.testing.assert_close(torch.stack(says), torch.full((2,), 1 / 1.0625), rtol=0.05, atol=0)
