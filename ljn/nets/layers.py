@@ -135,7 +135,7 @@ def perceive_and_pool(mlp: nn.Sequential, activation: nn.PReLU, points: Tensor) 
     Returns:
         `(B, C)`.
     """
-    last = mlp[-1]
+    last: Any = mlp[-1]
     is_dense = not torch.is_grad_enabled() or 2 * last.out_features > points.shape[1]
     if is_dense or bool((activation.weight < 0).any()):
         return activate_and_pool(mlp(points), activation, 1)

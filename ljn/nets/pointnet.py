@@ -1,7 +1,7 @@
 """PointNet (Qi et al. 2017; Fig. 3.2), without T-nets and batch normalisation, with PReLU."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -54,7 +54,7 @@ class PointNet(nn.Module):
         if shared is None:
             local = self.local(points)
         else:
-            first = self.local[0]
+            first: Any = self.local[0]
             own_weight, shared_weight = first.weight.split([points.shape[-1], shared.shape[-1]], -1)
             hidden = torch.baddbmm(
                 functional.linear(shared, shared_weight, first.bias)[:, None],

@@ -13,8 +13,8 @@ class SimpleBaseline(Detector):
 
     It sees the initial joints' rays alone, (x / z, y / z), which are the keypoints in normalised image coordinates;
     neither their depths nor the cloud. Its joints stand around the initial root, which stays where it is, so only its
-    root-aligned errors mean something. Unlike the thesis's networks it has batch normalisation and dropout; the weights' max-norm
-    of the original is left out.
+    root-aligned errors mean something. Unlike the thesis's networks it has batch normalisation and dropout; the
+    weights' max-norm of the original is left out.
 
     Args:
         channels: Width of the hidden layers.
