@@ -6,7 +6,7 @@ from torch import Tensor
 
 from ljn.body.skeleton import NUM_JOINTS
 from ljn.nets.detector import CloudDetector
-from ljn.nets.layers import OUTPUT_SCALE, PRELU_SLOPE, initialise, perceptron
+from ljn.nets.layers import OUTPUT_SCALE, initialise_for_prelu, perceptron
 from ljn.nets.pointnet import PointNet
 
 
@@ -18,6 +18,8 @@ class BasicDetector(CloudDetector):
         local_channels: First widths of the shared perceptron.
         global_channels: Its other widths, up to the global feature.
         head_channels: Hidden widths of the head.
+        slope: Of the PReLUs' negative sides before training. Near 1, a deep perceptron starts almost linear: what
+            the 72 coordinates say, a linear map of which is already a good detector, gets through its layers.
         output: See `CloudDetector`.
     """
 
@@ -27,15 +29,17 @@ class BasicDetector(CloudDetector):
         local_channels: Sequence[int] = (64, 64),
         global_channels: Sequence[int] = (64, 128, 1024),
         head_channels: Sequence[int] = (512, 256),
+        slope: float = 0.8,
         output: str = "offset",
     ) -> None:
         super().__init__(output)
-        self.trunk = PointNet(in_channels + 3 * NUM_JOINTS, local_channels, global_channels)
-        initialise(self.trunk.local[0], PRELU_SLOPE, parts=(in_channels, 3 * NUM_JOINTS))
+        self.trunk = PointNet(in_channels + 3 * NUM_JOINTS, local_channels, global_channels, slope)
+        initialise_for_prelu(self.trunk.local[0], slope, parts=(in_channels, 3 * NUM_JOINTS))
         self.head = perceptron(
             [global_channels[-1], *head_channels, 3 * NUM_JOINTS],
             last_activation=False,
             last_scale=OUTPUT_SCALE,
+            slope=slope,
         )
 
     def regress(self, points: Tensor, initial_joints: Tensor) -> Tensor:

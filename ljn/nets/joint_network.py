@@ -10,11 +10,10 @@ from ljn.geometry.points import ball_group, distance_matrix, gather_points
 from ljn.nets.detector import CloudDetector
 from ljn.nets.layers import (
     OUTPUT_SCALE,
-    PRELU_SLOPE,
     StackedLinear,
     StackedPReLU,
     activate_and_pool,
-    initialise,
+    initialise_for_prelu,
     stacked_perceptron,
 )
 from ljn.nets.pointnet import PointNet
@@ -75,7 +74,7 @@ class LocalJointNetwork(CloudDetector):
         num_shared = global_channels[-1] + (NUM_JOINTS if edm else 0)
         self.first = StackedLinear(NUM_JOINTS, self.num_local + num_shared, group_channels[0])
         parts = [3, local_channels[-1], global_channels[-1], *([NUM_JOINTS] if edm else [])]
-        initialise(self.first, PRELU_SLOPE, parts=parts)
+        initialise_for_prelu(self.first, parts=parts)
         self.first_activation = StackedPReLU(NUM_JOINTS)
         self.group = stacked_perceptron(NUM_JOINTS, group_channels, last_activation=False)
         self.group_activation = StackedPReLU(NUM_JOINTS)

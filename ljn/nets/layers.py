@@ -21,9 +21,12 @@ OUTPUT_SCALE = 0.1
 
 
 def perceptron(
-    channels: Sequence[int], last_activation: bool = True, last_scale: float = 1.0
+    channels: Sequence[int],
+    last_activation: bool = True,
+    last_scale: float = 1.0,
+    slope: float = PRELU_SLOPE,
 ) -> nn.Sequential:
-    """Linear layers with a PReLU after each (after the last one on request), conditioned by `initialise`.
+    """Linear layers with a PReLU after each (after the last one on request), conditioned by `initialise_for_prelu`.
 
     Applied to `(..., channels[0])`; on a cloud `(B, N, C)` it is PointNet's shared MLP. No batch
     normalisation: batches are small (section 3.6.1).
@@ -31,39 +34,62 @@ def perceptron(
     layers: list[nn.Module] = []
     for number, (fan_in, fan_out) in enumerate(pairwise(channels), start=1):
         scale = last_scale if number == len(channels) - 1 else 1.0
-        layers.append(initialise(nn.Linear(fan_in, fan_out), PRELU_SLOPE, scale))
+        layers.append(initialise_for_prelu(nn.Linear(fan_in, fan_out), slope, scale))
         if last_activation or number < len(channels) - 1:
-            layers.append(nn.PReLU())
+            layers.append(nn.PReLU(init=slope))
     return nn.Sequential(*layers)
 
 
-def initialise(layer: LayerT, slope: float = 0.0, scale: float = 1.0, parts: Sequence[int] = ()) -> LayerT:
+def initialise(layer: LayerT, slope: float = 0.0, scale: float = 1.0) -> LayerT:
     """Kaiming's initialisation: what comes out is as large as what went in, after a (leaky) ReLU of `slope`.
 
     Args:
         layer: With `weight` `(out, in)`, `(K, out, in)` or `(out, in, kh, kw)`, and `bias`, which becomes zero.
-        slope: Of the activation on its negative side: 0.25 for a PReLU, 0 for ReLU and GELU.
+        slope: Of the activation on its negative side; 0 for ReLU and GELU.
         scale: Factor of the weights; a small one for last layers, which then start near their bias.
+
+    Returns:
+        The layer.
+    """
+    fan_in = layer.weight[0].numel() if layer.weight.ndim == 4 else layer.weight.shape[-1]
+    nn.init.normal_(layer.weight, 0.0, scale * math.sqrt(2 / (1 + slope**2) / fan_in))
+    nn.init.zeros_(layer.bias)
+    return layer
+
+
+@torch.no_grad()
+def initialise_for_prelu(
+    layer: LayerT, slope: float = PRELU_SLOPE, scale: float = 1.0, parts: Sequence[int] = ()
+) -> LayerT:
+    """Kaiming's sizes for a PReLU, with orthogonal rows or columns.
+
+    Gaussian weights, layer after layer, squeeze all but a few directions of the input; orthogonal ones keep
+    what 72 coordinates say apart through a deep perceptron.
+
+    Args:
+        layer: With `weight` `(out, in)` or `(K, out, in)`, and `bias`, which becomes zero.
+        slope: See `initialise`.
+        scale: See `initialise`.
         parts: Channels of each part of the input, where it has several: each has the same say at first. A
             point's three coordinates would count for nothing beside hundreds of channels of a global feature.
 
     Returns:
         The layer.
     """
-    fan_in = layer.weight[0].numel() if layer.weight.ndim == 4 else layer.weight.shape[-1]
-    parts = parts or [fan_in]
-    gains = [scale * math.sqrt(2 / (1 + slope**2) / (width * len(parts))) for width in parts]
-    if len(parts) == 1:
-        nn.init.normal_(layer.weight, 0.0, gains[0])
-    else:
-        for weight, gain in zip(layer.weight.split(list(parts), -1), gains, strict=True):
-            nn.init.normal_(weight, 0.0, gain)
+    parts = list(parts) or [layer.weight.shape[-1]]
+    gain = scale * math.sqrt(2 / (1 + slope**2) / len(parts))
+    for weight in layer.weight.view(-1, *layer.weight.shape[-2:]):
+        fan_out = len(weight)
+        for part in weight.split(parts, -1):
+            part.copy_(
+                nn.init.orthogonal_(torch.empty_like(part), gain * max(1.0, fan_out / part.shape[-1]) ** 0.5)
+            )
     nn.init.zeros_(layer.bias)
     return layer
 
 
 class StackedLinear(nn.Module):
-    """One linear layer for each joint, run as one batched product, conditioned by `initialise` for a PReLU.
+    """One linear layer for each joint, run as one batched product, conditioned by `initialise_for_prelu`.
 
     Args:
         num_joints: K.
@@ -75,7 +101,7 @@ class StackedLinear(nn.Module):
         super().__init__()
         self.weight = nn.Parameter(torch.empty(num_joints, fan_out, fan_in))
         self.bias = nn.Parameter(torch.empty(num_joints, fan_out))
-        initialise(self, PRELU_SLOPE)
+        initialise_for_prelu(self)
 
     def forward(self, x: Tensor) -> Tensor:
         """`(K, M, fan_in)` -> `(K, M, fan_out)`."""
@@ -101,7 +127,7 @@ def stacked_perceptron(
     layers: list[nn.Module] = []
     for number, (fan_in, fan_out) in enumerate(pairwise(channels), start=1):
         scale = last_scale if number == len(channels) - 1 else 1.0
-        layers.append(initialise(StackedLinear(num_joints, fan_in, fan_out), PRELU_SLOPE, scale))
+        layers.append(initialise_for_prelu(StackedLinear(num_joints, fan_in, fan_out), scale=scale))
         if last_activation or number < len(channels) - 1:
             layers.append(StackedPReLU(num_joints))
     return nn.Sequential(*layers)

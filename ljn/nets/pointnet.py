@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from ljn.nets.layers import perceive_and_pool, perceptron
+from ljn.nets.layers import PRELU_SLOPE, perceive_and_pool, perceptron
 
 
 class PointFeatures(NamedTuple):
@@ -29,6 +29,7 @@ class PointNet(nn.Module):
         in_channels: Channels of a point.
         local_channels: Widths up to the local feature.
         global_channels: Widths from there to the global feature.
+        slope: Of the PReLUs' negative sides before training.
     """
 
     def __init__(
@@ -36,11 +37,12 @@ class PointNet(nn.Module):
         in_channels: int = 6,
         local_channels: Sequence[int] = (64, 64),
         global_channels: Sequence[int] = (64, 128, 1024),
+        slope: float = PRELU_SLOPE,
     ) -> None:
         super().__init__()
-        self.local = perceptron([in_channels, *local_channels])
-        self.lift = perceptron([local_channels[-1], *global_channels], last_activation=False)
-        self.lift_activation = nn.PReLU()
+        self.local = perceptron([in_channels, *local_channels], slope=slope)
+        self.lift = perceptron([local_channels[-1], *global_channels], last_activation=False, slope=slope)
+        self.lift_activation = nn.PReLU(init=slope)
         self.out_channels = global_channels[-1]
 
     def forward(self, points: Tensor, shared: Tensor | None = None) -> PointFeatures:

@@ -43,6 +43,8 @@ def batch(size=3, num_points=40, dtype=torch.float32):
 
 def test_every_parameter_gets_a_gradient(make):
     net = make()
+    with torch.no_grad():
+        net.trunk.lift[-1].bias -= 1  # of some channels all values are negative, and the last slope matters
     net(*batch()).square().sum().backward()
     without = [name for name, p in net.named_parameters() if p.grad is None or not p.grad.any()]
     assert without == []
@@ -111,28 +113,35 @@ def people(size=4, num_points=512):
     return torch.cat([points, normals], -1), joints
 
 
-def spreads_at_the_start(net):
-    """Spread of the centred input, of each activation's output in turn, and of the predicted offsets."""
-    spreads = []
+def size(x):
+    return float(x.detach().square().mean().sqrt())
 
-    def measure(module, inputs, output):
-        spreads.append(float(output.detach().std()))
 
-    for module in net.modules():
+def sizes_at_the_start(net):
+    """Sizes of the centred input, of each activation's output in turn with its name, and of the predicted offsets."""
+    sizes = []
+    for name, module in net.named_modules():
         if isinstance(module, nn.PReLU | StackedPReLU | nn.ReLU):
-            module.register_forward_hook(measure)
+            module.register_forward_hook(
+                lambda module, inputs, output, name=name: sizes.append((name, size(output)))
+            )
     points, joints = people()
     with torch.no_grad():
         pred = net(*(points, joints) if "points" in net.takes else (joints,))
     start = joints[:, :1] if net.is_root_relative else joints
     given = torch.cat([points[..., :3] - points[..., :3].mean(1, keepdim=True), points[..., 3:]], -1)
-    return float(given.std()), spreads, float((pred - start).square().sum(-1).mean().sqrt())
+    return size(given), sizes, size(pred - start)
 
 
 def is_well_conditioned(net):
-    given, spreads, offset = spreads_at_the_start(net)
-    ratios = [after / before for before, after in itertools.pairwise([given, *spreads])]
-    return all(1 / 2 < ratio < 2 for ratio in ratios) and 1 / 3 < spreads[-1] / given < 3 and offset < 0.5
+    """Whether each layer's output is half to twice as large as the one before it, but for pooling's: a maximum over
+    many points is larger than they are by nature."""
+    given, sizes, offset = sizes_at_the_start(net)
+    sound = [
+        1 / 2 < after / before < (3.2 if name in ("trunk.lift_activation", "group_activation") else 2)
+        for (_, before), (name, after) in itertools.pairwise([("", given), *sizes])
+    ]
+    return all(sound) and 1 / 2 < sizes[-1][1] / given < 4 and offset < 0.3
 
 
 @pytest.mark.parametrize("name", THESIS)

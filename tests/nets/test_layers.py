@@ -3,9 +3,11 @@ import torch
 from torch import nn
 
 from ljn.nets.layers import (
+    PRELU_SLOPE,
+    StackedLinear,
     StackedPReLU,
     activate_and_pool,
-    initialise,
+    initialise_for_prelu,
     perceive_and_pool,
     perceptron,
     stacked_perceptron,
@@ -70,8 +72,17 @@ def test_perceiving_and_pooling_through_few_points_equals_pooling_all(out_featur
             torch.testing.assert_close(perceive_and_pool(mlp, activation, x), reference)
 
 
-def test_a_layer_of_several_parts_starts_with_the_same_say_for_each():
+@pytest.mark.parametrize("shape", [(20, 103), (200, 103), (3, 200, 103)])
+def test_a_layer_starts_orthogonal_and_with_the_same_say_for_each_part(shape):
     torch.manual_seed(0)
-    layer = initialise(nn.Linear(303, 4000), slope=0.25, parts=(3, 300))
-    says = [part.square().sum(-1).mean() for part in layer.weight.detach().split([3, 300], -1)]
-    torch.testing.assert_close(torch.stack(says), torch.full((2,), 1 / 1.0625), rtol=0.05, atol=0)
+    layer = StackedLinear(*shape[:1], shape[2], shape[1]) if len(shape) == 3 else nn.Linear(*shape[::-1])
+    initialise_for_prelu(layer, PRELU_SLOPE, parts=(3, 100))
+    gain = 2 / (1 + PRELU_SLOPE**2) / 2
+    for part in layer.weight.detach().split([3, 100], -1):
+        says = part.square().sum(-1).mean(-1)  # of independent inputs of size 1
+        torch.testing.assert_close(says, torch.full_like(says, gain))
+        gram = part @ part.mT if part.shape[-2] < part.shape[-1] else part.mT @ part
+        diagonal = gram.diagonal(dim1=-2, dim2=-1)
+        torch.testing.assert_close(
+            gram, torch.diag_embed(diagonal.mean(-1, keepdim=True).expand_as(diagonal))
+        )
