@@ -8,6 +8,7 @@ from torch import Tensor, nn
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
 
+from ljn.body.skeleton import ROOT
 from ljn.data import Batch
 from ljn.losses import check_loss, joint_loss
 from ljn.metrics import JointMetrics
@@ -49,9 +50,12 @@ class JointDetector(StageModule):
         return self.net.is_root_relative
 
     def loss(self, batch: Batch) -> Tensor:
-        """See `StageModule.loss`."""
-        estimates = self.net.estimates(*self.observation(batch))
-        return joint_loss(estimates, batch["joints"], self.kind_of_loss)
+        """See `StageModule.loss`; root-aligned where the network `is_root_relative`, as its metrics are."""
+        estimates, joints = self.net.estimates(*self.observation(batch)), batch["joints"]
+        if self.is_root_relative:
+            estimates = estimates - estimates[:, :, ROOT, None]
+            joints = joints - joints[:, ROOT, None]
+        return joint_loss(estimates, joints, self.kind_of_loss)
 
     def evaluate(self, batch: Batch, metrics: Any) -> dict[str, Tensor]:
         """See `StageModule.evaluate`; predicts `pred_joints` `(B, 24, 3)`, metres, camera frame."""

@@ -2,12 +2,11 @@
 
 from collections.abc import Sequence
 
-import torch
 from torch import Tensor
 
 from ljn.body.skeleton import NUM_JOINTS
 from ljn.nets.detector import CloudDetector
-from ljn.nets.layers import OUTPUT_SCALE, perceptron
+from ljn.nets.layers import OUTPUT_SCALE, initialise_for_prelu, perceptron
 from ljn.nets.pointnet import PointNet
 
 
@@ -19,6 +18,8 @@ class BasicDetector(CloudDetector):
         local_channels: First widths of the shared perceptron.
         global_channels: Its other widths, up to the global feature.
         head_channels: Hidden widths of the head.
+        slope: Of the PReLUs' negative sides before training. Near 1, a deep perceptron starts almost linear: what
+            the 72 coordinates say, a linear map of which is already a good detector, gets through its layers.
         output: See `CloudDetector`.
     """
 
@@ -28,18 +29,20 @@ class BasicDetector(CloudDetector):
         local_channels: Sequence[int] = (64, 64),
         global_channels: Sequence[int] = (64, 128, 1024),
         head_channels: Sequence[int] = (512, 256),
+        slope: float = 0.8,
         output: str = "offset",
     ) -> None:
         super().__init__(output)
-        self.trunk = PointNet(in_channels + 3 * NUM_JOINTS, local_channels, global_channels)
+        self.trunk = PointNet(in_channels + 3 * NUM_JOINTS, local_channels, global_channels, slope=slope)
+        initialise_for_prelu(self.trunk.local[0], slope, parts=(in_channels, 3 * NUM_JOINTS))
         self.head = perceptron(
             [global_channels[-1], *head_channels, 3 * NUM_JOINTS],
             last_activation=False,
             last_scale=OUTPUT_SCALE,
+            slope=slope,
         )
 
     def regress(self, points: Tensor, initial_joints: Tensor) -> Tensor:
         """See `CloudDetector.regress`."""
-        coordinates = initial_joints.flatten(1)[:, None].expand(-1, points.shape[1], -1)
-        features = self.trunk(torch.cat([points, coordinates], -1))
+        features = self.trunk(points, initial_joints.flatten(1))
         return self.head(features.pooled).unflatten(-1, (NUM_JOINTS, 3))

@@ -8,7 +8,14 @@ from torch import Tensor
 from ljn.body.skeleton import NUM_JOINTS
 from ljn.geometry.points import ball_group, distance_matrix, gather_points
 from ljn.nets.detector import CloudDetector
-from ljn.nets.layers import OUTPUT_SCALE, StackedLinear, StackedPReLU, activate_and_pool, stacked_perceptron
+from ljn.nets.layers import (
+    OUTPUT_SCALE,
+    StackedLinear,
+    StackedPReLU,
+    activate_and_pool,
+    initialise_for_prelu,
+    stacked_perceptron,
+)
 from ljn.nets.pointnet import PointNet
 
 
@@ -66,6 +73,8 @@ class LocalJointNetwork(CloudDetector):
         self.num_local = 3 + local_channels[-1]
         num_shared = global_channels[-1] + (NUM_JOINTS if edm else 0)
         self.first = StackedLinear(NUM_JOINTS, self.num_local + num_shared, group_channels[0])
+        parts = [3, local_channels[-1], global_channels[-1], *([NUM_JOINTS] if edm else [])]
+        initialise_for_prelu(self.first, parts=parts)
         self.first_activation = StackedPReLU(NUM_JOINTS)
         self.group = stacked_perceptron(NUM_JOINTS, group_channels, last_activation=False)
         self.group_activation = StackedPReLU(NUM_JOINTS)

@@ -9,6 +9,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+from ljn.geometry.points import gather_points
+
 LayerT = TypeVar("LayerT", bound=Any)
 
 
@@ -19,9 +21,12 @@ OUTPUT_SCALE = 0.1
 
 
 def perceptron(
-    channels: Sequence[int], last_activation: bool = True, last_scale: float = 1.0
+    channels: Sequence[int],
+    last_activation: bool = True,
+    last_scale: float = 1.0,
+    slope: float = PRELU_SLOPE,
 ) -> nn.Sequential:
-    """Linear layers with a PReLU after each (after the last one on request), conditioned by `initialise`.
+    """Linear layers with a PReLU after each (after the last one on request), conditioned by `initialise_for_prelu`.
 
     Applied to `(..., channels[0])`; on a cloud `(B, N, C)` it is PointNet's shared MLP. No batch
     normalisation: batches are small (section 3.6.1).
@@ -29,9 +34,9 @@ def perceptron(
     layers: list[nn.Module] = []
     for number, (fan_in, fan_out) in enumerate(pairwise(channels), start=1):
         scale = last_scale if number == len(channels) - 1 else 1.0
-        layers.append(initialise(nn.Linear(fan_in, fan_out), PRELU_SLOPE, scale))
+        layers.append(initialise_for_prelu(nn.Linear(fan_in, fan_out), slope, scale))
         if last_activation or number < len(channels) - 1:
-            layers.append(nn.PReLU())
+            layers.append(nn.PReLU(init=slope))
     return nn.Sequential(*layers)
 
 
@@ -41,7 +46,7 @@ def initialise(layer: LayerT, slope: float = 0.0, scale: float = 1.0, fan_in: in
     Args:
         layer: With `weight` `(out, in)`, `(K, out, in)` or `(out, in, kh, kw)`, and `bias`, which becomes zero where
             there is one.
-        slope: Of the activation on its negative side: 0.25 for a PReLU, 0 for ReLU and GELU.
+        slope: Of the activation on its negative side; 0 for ReLU and GELU.
         scale: Factor of the weights; a small one for last layers, which then start near their bias.
         fan_in: Input channels, where the layer is a part of one that has more.
 
@@ -53,6 +58,37 @@ def initialise(layer: LayerT, slope: float = 0.0, scale: float = 1.0, fan_in: in
     nn.init.normal_(layer.weight, 0.0, scale * math.sqrt(2 / (1 + slope**2) / fan_in))
     if layer.bias is not None:
         nn.init.zeros_(layer.bias)
+    return layer
+
+
+@torch.no_grad()
+def initialise_for_prelu(
+    layer: LayerT, slope: float = PRELU_SLOPE, scale: float = 1.0, parts: Sequence[int] = ()
+) -> LayerT:
+    """Kaiming's sizes for a PReLU, with orthogonal rows or columns.
+
+    Gaussian weights, layer after layer, squeeze all but a few directions of the input; orthogonal ones keep
+    what 72 coordinates say apart through a deep perceptron.
+
+    Args:
+        layer: With `weight` `(out, in)` or `(K, out, in)`, and `bias`, which becomes zero.
+        slope: See `initialise`.
+        scale: See `initialise`.
+        parts: Channels of each part of the input, where it has several: each has the same say at first. A
+            point's three coordinates would count for nothing beside hundreds of channels of a global feature.
+
+    Returns:
+        The layer.
+    """
+    parts = list(parts) or [layer.weight.shape[-1]]
+    gain = scale * math.sqrt(2 / (1 + slope**2) / len(parts))
+    for weight in layer.weight.view(-1, *layer.weight.shape[-2:]):
+        fan_out = len(weight)
+        for part in weight.split(parts, -1):
+            part.copy_(
+                nn.init.orthogonal_(torch.empty_like(part), gain * max(1.0, fan_out / part.shape[-1]) ** 0.5)
+            )
+    nn.init.zeros_(layer.bias)
     return layer
 
 
@@ -80,7 +116,7 @@ def apply_shared(layers: Iterable[nn.Module], points: Tensor, shared: Tensor | N
 
 
 class StackedLinear(nn.Module):
-    """One linear layer for each joint, run as one batched product, conditioned by `initialise` for a PReLU.
+    """One linear layer for each joint, run as one batched product, conditioned by `initialise_for_prelu`.
 
     Args:
         num_joints: K.
@@ -92,7 +128,7 @@ class StackedLinear(nn.Module):
         super().__init__()
         self.weight = nn.Parameter(torch.empty(num_joints, fan_out, fan_in))
         self.bias = nn.Parameter(torch.empty(num_joints, fan_out))
-        initialise(self, PRELU_SLOPE)
+        initialise_for_prelu(self)
 
     def forward(self, x: Tensor) -> Tensor:
         """`(K, M, fan_in)` -> `(K, M, fan_out)`."""
@@ -118,7 +154,7 @@ def stacked_perceptron(
     layers: list[nn.Module] = []
     for number, (fan_in, fan_out) in enumerate(pairwise(channels), start=1):
         scale = last_scale if number == len(channels) - 1 else 1.0
-        layers.append(initialise(StackedLinear(num_joints, fan_in, fan_out), PRELU_SLOPE, scale))
+        layers.append(initialise_for_prelu(StackedLinear(num_joints, fan_in, fan_out), scale=scale))
         if last_activation or number < len(channels) - 1:
             layers.append(StackedPReLU(num_joints))
     return nn.Sequential(*layers)
@@ -135,3 +171,34 @@ def activate_and_pool(x: Tensor, activation: nn.PReLU | StackedPReLU, dim: int) 
     if bool((activation.weight < 0).any()):
         pooled = torch.maximum(pooled, activation(x.min(dim).values))
     return pooled
+
+
+def perceive_and_pool(
+    mlp: nn.Sequential, activation: nn.PReLU, points: Tensor, shared: Tensor | None = None
+) -> Tensor:
+    """`activate_and_pool(mlp(points), activation, 1)`, gradients passing through few points alone.
+
+    A channel's maximum is one point's value; the other points' gradients are zero. A first pass without gradients
+    finds one point for each of C channels, and a second one goes through these: a half of the work where there
+    are many more points.
+
+    Args:
+        mlp: A `perceptron` without its last activation.
+        activation: The last activation.
+        points: `(B, N, C_in)`; without the last channels where these are `shared`.
+        shared: See `apply_shared`.
+
+    Returns:
+        `(B, C)`.
+    """
+    layers: list[Any] = list(mlp)
+    *inner, last = layers
+    is_dense = not inner or not torch.is_grad_enabled() or 2 * last.out_features > points.shape[1]
+    if is_dense or bool((activation.weight < 0).any()):
+        return activate_and_pool(apply_shared(mlp, points, shared), activation, 1)
+    with torch.no_grad():
+        index = apply_shared(mlp, points, shared).argmax(1)  # (B, C)
+    hidden = apply_shared(
+        inner, gather_points(points, index), shared
+    )  # (B, C, C_hidden): row c for channel c
+    return activation((hidden * last.weight).sum(-1) + last.bias)

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 from torch import Tensor, nn
 
-from ljn.nets.layers import activate_and_pool, apply_shared, perceptron
+from ljn.nets.layers import PRELU_SLOPE, apply_shared, perceive_and_pool, perceptron
 
 
 class PointFeatures(NamedTuple):
@@ -29,6 +29,7 @@ class PointNet(nn.Module):
         global_channels: Widths from there to the global feature.
         carried_channels: How many channels, which all points of a cloud share, are given beside the local features,
             too; None: they reach the global feature through those alone.
+        slope: Of the PReLUs' negative sides before training.
     """
 
     def __init__(
@@ -37,14 +38,17 @@ class PointNet(nn.Module):
         local_channels: Sequence[int] = (64, 64),
         global_channels: Sequence[int] = (64, 128, 1024),
         carried_channels: int | None = None,
+        slope: float = PRELU_SLOPE,
     ) -> None:
         super().__init__()
-        self.local = perceptron([in_channels, *local_channels])
+        self.local = perceptron([in_channels, *local_channels], slope=slope)
         self.carried_channels = carried_channels or 0
         self.lift = perceptron(
-            [local_channels[-1] + self.carried_channels, *global_channels], last_activation=False
+            [local_channels[-1] + self.carried_channels, *global_channels],
+            last_activation=False,
+            slope=slope,
         )
-        self.lift_activation = nn.PReLU()
+        self.lift_activation = nn.PReLU(init=slope)
         self.out_channels = global_channels[-1]
 
     def forward(self, points: Tensor, shared: Tensor | None = None) -> PointFeatures:
@@ -56,8 +60,8 @@ class PointNet(nn.Module):
                 that is None.
         """
         local = apply_shared(self.local, points, shared)
-        hidden = apply_shared(self.lift, local, shared if self.carried_channels else None)
-        return PointFeatures(local, activate_and_pool(hidden, self.lift_activation, 1))
+        carried = shared if self.carried_channels else None
+        return PointFeatures(local, perceive_and_pool(self.lift, self.lift_activation, local, carried))
 
     def global_feature(self, points: Tensor, shared: Tensor | None = None) -> Tensor:
         """The global feature `(B, out_channels)`, as `PointNet2.global_feature`; see `forward`."""

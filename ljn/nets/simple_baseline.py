@@ -5,15 +5,16 @@ from torch import Tensor, nn
 
 from ljn.body.skeleton import NUM_JOINTS, ROOT
 from ljn.nets.detector import Detector
+from ljn.nets.layers import OUTPUT_SCALE, initialise
 
 
 class SimpleBaseline(Detector):
     """A residual network from the 2D keypoints to 3D joints relative to the root.
 
     It sees the initial joints' rays alone, (x / z, y / z), which are the keypoints in normalised image coordinates;
-    neither their depths nor the cloud. Its joints stand around the initial root, so only its root-aligned errors
-    mean something. Unlike the thesis's networks it has batch normalisation and dropout; the weights' max-norm
-    of the original is left out.
+    neither their depths nor the cloud. Its joints stand around the initial root, which stays where it is, so only its
+    root-aligned errors mean something. Unlike the thesis's networks it has batch normalisation and dropout; the
+    weights' max-norm of the original is left out.
 
     Args:
         channels: Width of the hidden layers.
@@ -28,13 +29,14 @@ class SimpleBaseline(Detector):
         super().__init__()
 
         def layer(fan_in: int) -> list[nn.Module]:
-            return [nn.Linear(fan_in, channels), nn.BatchNorm1d(channels), nn.ReLU(), nn.Dropout(dropout)]
+            linear = initialise(nn.Linear(fan_in, channels))
+            return [linear, nn.BatchNorm1d(channels), nn.ReLU(), nn.Dropout(dropout)]
 
         self.first = nn.Sequential(*layer(2 * NUM_JOINTS))
         self.blocks = nn.ModuleList(
             nn.Sequential(*layer(channels), *layer(channels)) for _ in range(num_blocks)
         )
-        self.last = nn.Linear(channels, 3 * NUM_JOINTS)
+        self.last = initialise(nn.Linear(channels, 3 * (NUM_JOINTS - 1)), scale=OUTPUT_SCALE)
 
     def forward(self, initial_joints: Tensor) -> Tensor:
         """Joints from initial joints, both `(B, 24, 3)`, metres, camera frame; the root stays where it is."""
@@ -44,4 +46,5 @@ class SimpleBaseline(Detector):
         hidden = self.first(rays.flatten(1))
         for block in self.blocks:
             hidden = hidden + block(hidden)
-        return self.last(hidden).unflatten(-1, (NUM_JOINTS, 3)) + initial_joints[:, ROOT, None]
+        root = initial_joints[:, ROOT, None]
+        return torch.cat([root, self.last(hidden).unflatten(-1, (NUM_JOINTS - 1, 3)) + root], 1)

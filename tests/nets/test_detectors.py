@@ -1,8 +1,13 @@
+import itertools
+
 import pytest
 import torch
+from torch import nn
 
 from ljn.nets.basic_detector import BasicDetector
 from ljn.nets.joint_network import LocalJointNetwork
+from ljn.nets.layers import StackedLinear, StackedPReLU
+from ljn.nets.simple_baseline import SimpleBaseline
 from ljn.nets.yardsticks import MeanOffset, Ridge
 
 SIZES = {"local_channels": (6, 6), "global_channels": (6, 8, 10), "head_channels": (8, 6)}
@@ -38,6 +43,8 @@ def batch(size=3, num_points=40, dtype=torch.float32):
 
 def test_every_parameter_gets_a_gradient(make):
     net = make()
+    with torch.no_grad():
+        net.trunk.lift[-1].bias -= 1  # of some channels all values are negative, and the last slope matters
     net(*batch()).square().sum().backward()
     without = [name for name, p in net.named_parameters() if p.grad is None or not p.grad.any()]
     assert without == []
@@ -82,6 +89,79 @@ def test_a_few_samples_can_be_overfitted(make, output):
         loss.backward()
         optimizer.step()
     assert loss < 0.02 * 24 * 3 * 0.1**2
+
+
+SMALL = {"local_channels": (32, 32), "global_channels": (32, 64, 128), "head_channels": (128, 64)}
+THESIS = {
+    "proposed": lambda: LocalJointNetwork(RADII),
+    "proposed, small": lambda: LocalJointNetwork(RADII, 64, group_channels=(32, 64, 128), **SMALL),
+    "no_edm": lambda: LocalJointNetwork(RADII, edm=False),
+    "basic": BasicDetector,
+    "basic, small": lambda: BasicDetector(**SMALL),
+    "simple_baseline": SimpleBaseline,
+}
+
+
+def people(size=4, num_points=512):
+    """Initial joints spread as a person's, points and normals around them."""
+    generator = torch.Generator().manual_seed(1)
+    joints = torch.randn(size, 24, 3, generator=generator) * torch.tensor([0.25, 0.45, 0.15])
+    joints += torch.tensor([0.3, 0.1, 2.2])
+    points = joints.repeat(1, -(-num_points // 24), 1)[:, :num_points]
+    points = points + 0.08 * torch.randn(points.shape, generator=generator)
+    normals = nn.functional.normalize(torch.randn(points.shape, generator=generator), dim=-1)
+    return torch.cat([points, normals], -1), joints
+
+
+def size(x):
+    return float(x.detach().square().mean().sqrt())
+
+
+def sizes_at_the_start(net):
+    """Sizes of the centred input, of each activation's output in turn with its name, and of the predicted offsets."""
+    sizes = []
+    for name, module in net.named_modules():
+        if isinstance(module, nn.PReLU | StackedPReLU | nn.ReLU):
+            module.register_forward_hook(
+                lambda module, inputs, output, name=name: sizes.append((name, size(output)))
+            )
+    points, joints = people()
+    with torch.no_grad():
+        pred = net(*(points, joints) if "points" in net.takes else (joints,))
+    start = joints[:, :1] if net.is_root_relative else joints
+    given = torch.cat([points[..., :3] - points[..., :3].mean(1, keepdim=True), points[..., 3:]], -1)
+    return size(given), sizes, size(pred - start)
+
+
+def is_well_conditioned(net):
+    """Whether each layer's output is half to twice as large as the one before it, but for pooling's: a maximum over
+    many points is larger than they are by nature."""
+    given, sizes, offset = sizes_at_the_start(net)
+    sound = [
+        1 / 2 < after / before < (3.2 if name in ("trunk.lift_activation", "group_activation") else 2)
+        for (_, before), (name, after) in itertools.pairwise([("", given), *sizes])
+    ]
+    return all(sound) and 1 / 2 < sizes[-1][1] / given < 4 and offset < 0.3
+
+
+@pytest.mark.parametrize("name", THESIS)
+def test_at_the_start_no_layer_drowns_or_blows_up_its_input_and_offsets_are_small(name):
+    torch.manual_seed(0)
+    assert is_well_conditioned(THESIS[name]())
+
+
+@pytest.mark.parametrize("name", THESIS)
+def test_with_the_default_initialisation_of_pytorch_they_would(name):
+    torch.manual_seed(0)
+    net = THESIS[name]()
+    for module in net.modules():
+        if isinstance(module, nn.Linear):
+            module.reset_parameters()
+        elif isinstance(module, StackedLinear):
+            bound = module.weight.shape[-1] ** -0.5
+            nn.init.uniform_(module.weight, -bound, bound)
+            nn.init.uniform_(module.bias, -bound, bound)
+    assert not is_well_conditioned(net)
 
 
 def of_joint(layer, joint, x):

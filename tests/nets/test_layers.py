@@ -3,9 +3,13 @@ import torch
 from torch import nn
 
 from ljn.nets.layers import (
+    PRELU_SLOPE,
+    StackedLinear,
     StackedPReLU,
     activate_and_pool,
     apply_shared,
+    initialise_for_prelu,
+    perceive_and_pool,
     perceptron,
     stacked_perceptron,
 )
@@ -56,3 +60,39 @@ def test_what_all_points_share_is_as_if_each_point_carried_it():
     carried = torch.cat([points, shared[:, None].expand(-1, 4, -1)], -1)
     torch.testing.assert_close(apply_shared(layers, points, shared), layers(carried))
     torch.testing.assert_close(apply_shared(layers, carried, None), layers(carried))
+
+
+@pytest.mark.parametrize("out_features", [4, 8])
+def test_perceiving_and_pooling_through_few_points_equals_pooling_all(out_features):
+    torch.manual_seed(0)
+    mlp = perceptron([3, 5, out_features], last_activation=False).double()
+    for slope in (0.25, -0.3):
+        activation = nn.PReLU(init=slope).double()
+        x = torch.randn(2, 17, 3, dtype=torch.float64, requires_grad=True)
+        pooled = perceive_and_pool(mlp, activation, x)
+        reference = activation(mlp(x)).amax(1)
+        torch.testing.assert_close(pooled, reference)
+        weight = torch.randn_like(reference)
+        inputs = [x, *mlp.parameters(), activation.weight]
+        torch.testing.assert_close(
+            torch.autograd.grad((pooled * weight).sum(), inputs, materialize_grads=True),
+            torch.autograd.grad((reference * weight).sum(), inputs, materialize_grads=True),
+        )
+        with torch.no_grad():
+            torch.testing.assert_close(perceive_and_pool(mlp, activation, x), reference)
+
+
+@pytest.mark.parametrize("shape", [(20, 103), (200, 103), (3, 200, 103)])
+def test_a_layer_starts_orthogonal_and_with_the_same_say_for_each_part(shape):
+    torch.manual_seed(0)
+    layer = StackedLinear(*shape[:1], shape[2], shape[1]) if len(shape) == 3 else nn.Linear(*shape[::-1])
+    initialise_for_prelu(layer, PRELU_SLOPE, parts=(3, 100))
+    gain = 2 / (1 + PRELU_SLOPE**2) / 2
+    for part in layer.weight.detach().split([3, 100], -1):
+        says = part.square().sum(-1).mean(-1)  # of independent inputs of size 1
+        torch.testing.assert_close(says, torch.full_like(says, gain))
+        gram = part @ part.mT if part.shape[-2] < part.shape[-1] else part.mT @ part
+        diagonal = gram.diagonal(dim1=-2, dim2=-1)
+        torch.testing.assert_close(
+            gram, torch.diag_embed(diagonal.mean(-1, keepdim=True).expand_as(diagonal))
+        )
