@@ -58,14 +58,13 @@ class PoseRecords:
     @property
     def kinds(self) -> np.ndarray:
         """`(R,)` str: of a procedural pose its family, else `clip` or, of parts from several donors, `recombined`."""
-        kinds = [
-            name.removeprefix("proc/")
-            if name.startswith("proc/")
-            else "recombined"
-            if "|" in name
-            else "clip"
-            for name in self.sequence.tolist()
-        ]
+
+        def kind(name: str) -> str:
+            if "|" in name:
+                return "recombined"
+            return name.removeprefix("proc/") if name.startswith("proc/") else "clip"
+
+        kinds = [kind(name) for name in self.sequence.tolist()]
         return np.array(kinds, dtype=str)
 
     @cached_property

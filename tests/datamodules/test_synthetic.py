@@ -15,6 +15,7 @@ from datamodules.batches import BLOCK, EpochSampler, RepeatedBatches
 from datamodules.placement import place
 from datamodules.sources import SPLITS
 from datamodules.sources.embedded import EmbeddedSource
+from datamodules.sources.embedded.source import FAMILY_SHARES
 from datamodules.synthesis import SynthesisSettings, concatenate
 from ljn.body import SMPL
 from ljn.body.skeleton import ROOT
@@ -390,3 +391,16 @@ def test_without_redrawing_every_epoch_shows_the_same_samples_in_another_order(m
     # Other neighbours in a batch round the body's products otherwise; normals magnify it.
     torch.testing.assert_close(*positions, atol=1e-5, rtol=0)
     torch.testing.assert_close(*normals, atol=1e-2, rtol=0)
+
+
+def test_kinds_of_poses_and_headings_are_those_of_the_samples(make_datamodule):
+    module = make_datamodule(num_test=300)
+    module.setup("test")
+    groups = module.groups("test")
+    kinds = set(groups["pose"])
+    assert {"clip", "recombined", "walk"} <= kinds <= {"clip", "recombined", *FAMILY_SHARES}
+    # 62 % of the headings are within 45 degrees of the camera, of bodies that stand upright at least.
+    upright = ~np.isin(groups["pose"], ["lie", "crawl"])
+    facing = (groups["heading"][upright] == "facing").mean()
+    assert 0.5 < facing < 0.72
+    assert 0.1 < (groups["heading"][upright] == "away").mean() < 0.3
