@@ -9,7 +9,6 @@ lie in `SHIPPED` and are loaded by name.
 
 import hashlib
 import json
-import os
 import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -23,7 +22,7 @@ from torch import Tensor
 from ljn import reading
 from ljn.optional import import_huggingface_hub
 from ljn.reading import READ_ERRORS, brief, plain_values, reason, shown
-from ljn.runs.files import write_json
+from ljn.runs.files import write_atomically, write_json
 
 PACKAGE_VERSION = 1
 SUFFIX = ".safetensors"
@@ -83,12 +82,7 @@ def write_package(
     # A single text: of several, the order in the file would be by chance, and with it the checksum.
     data = save(tensors, {_TEXT: json.dumps(about)})
     path.parent.mkdir(parents=True, exist_ok=True)
-    draft = path.with_name(f"{path.name}.{os.getpid()}.tmp")
-    try:
-        draft.write_bytes(data)
-        draft.replace(path)
-    finally:
-        draft.unlink(missing_ok=True)
+    write_atomically(path, data)
     index = path.with_name(INDEX)
     entries = _index(path.parent) if index.is_file() else {}
     write_json(index, dict(sorted({**entries, path.stem: _facts(data)}.items())))

@@ -11,7 +11,7 @@ from omegaconf import DictConfig, OmegaConf
 from ljn.pipeline.pipeline import Pipeline
 from ljn.runs import layout
 from ljn.runs.checkpoints import Checkpoint, for_package, read_checkpoint
-from ljn.runs.files import read_json, read_metrics
+from ljn.runs.files import read_json
 from ljn.runs.keys import CONFIG_GROUPS, Key, key_of, kind_of
 from ljn.runs.packages import NAME, PRECISIONS, SUFFIX, find_package, write_package
 from ljn.tasks.validation import check_writable
@@ -21,7 +21,16 @@ _COMMAND = (
     "python run.py task=package ckpt_path=DETECTOR.ckpt mesh_ckpt_path=MESH.ckpt task.name=NAME "
     "task.licence=CC-BY-4.0"
 )
-_OF_RECORD = ("commit", "is_dirty", "num_parameters", "wall_time_s", "device", "versions", "started")
+_OF_RECORD = (
+    "commit",
+    "is_dirty",
+    "begins_with",
+    "num_parameters",
+    "wall_time_s",
+    "device",
+    "versions",
+    "started",
+)
 
 
 def package(cfg: DictConfig) -> dict[str, float]:
@@ -62,7 +71,9 @@ def package(cfg: DictConfig) -> dict[str, float]:
     if task.mesh_ckpt_path is not None:
         checkpoints["mesh"] = read_checkpoint(task.mesh_ckpt_path, "task.mesh_ckpt_path", "mesh")
     path = directory / f"{task.name}{SUFFIX}"
-    stages = {name: for_package(each, _config(each), _training(each)) for name, each in checkpoints.items()}
+    trainings = {name: _training(each) for name, each in checkpoints.items()}
+    _check_trained_on(checkpoints["detector"], trainings.get("mesh", {}).get("detector"))
+    stages = {name: for_package(each, _config(each), trainings[name]) for name, each in checkpoints.items()}
     states = {name: each.state for name, each in checkpoints.items()}
     write_package(path, task.name, task.licence, stages, states, task.precision)
 
@@ -118,12 +129,24 @@ def _training(checkpoint: Checkpoint) -> dict[str, Any]:
             checkpoint.run,
         )
         return about
-    about |= {key: record.get(key) for key in _OF_RECORD}
+    about |= _without_paths({key: record.get(key) for key in _OF_RECORD})
+    data = record.get("data")
+    about["detector"] = _without_paths(data.get("detector")) if isinstance(data, dict) else None
     if isinstance(overrides := record.get("overrides"), list):
         about["command"] = " ".join(["python run.py", *filter(_is_of_training, map(str, overrides))])
     if checkpoint.path.name == Path(layout.BEST_CHECKPOINT).name:
-        about["metrics"] = read_metrics(directory)
+        about["metrics"] = read_json(directory / layout.METRICS)
     return about
+
+
+def _check_trained_on(detector: Checkpoint, trained_on: Any) -> None:
+    """Warn where a mesh regressor was trained on another detector's joints."""
+    if isinstance(trained_on, dict) and trained_on.get("hash") != detector.file_hash:
+        _LOG.warning(
+            "the mesh regressor was trained on the joints of another detector, %s, than this one, %s",
+            trained_on.get("hash"),
+            detector.file_hash,
+        )
 
 
 def _is_of_training(override: str) -> bool:
