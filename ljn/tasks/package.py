@@ -22,14 +22,7 @@ _COMMAND = (
     "task.licence=CC-BY-4.0"
 )
 _OF_RECORD = (
-    "commit",
-    "is_dirty",
-    "begins_with",
-    "num_parameters",
-    "wall_time_s",
-    "device",
-    "versions",
-    "started",
+    *("commit", "is_dirty", "begins_with", "num_parameters", "wall_time_s", "device", "versions", "started"),
 )
 
 
@@ -63,10 +56,8 @@ def package(cfg: DictConfig) -> dict[str, float]:
         )
     directory = Path(task.directory or Path(cfg.paths.output_dir) / "packages")
     check_writable(directory, "task.directory")
-    Pipeline.load(
-        cfg.ckpt_path, task.mesh_ckpt_path, body_path=cfg.body.path
-    )  # they fit each other and the body
-
+    # The two fit each other and the body.
+    Pipeline.load(cfg.ckpt_path, task.mesh_ckpt_path, body_path=cfg.body.path)
     checkpoints = {"detector": read_checkpoint(cfg.ckpt_path)}
     if task.mesh_ckpt_path is not None:
         checkpoints["mesh"] = read_checkpoint(task.mesh_ckpt_path, "task.mesh_ckpt_path", "mesh")

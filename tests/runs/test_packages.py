@@ -10,6 +10,7 @@ import torch
 from safetensors.torch import save
 
 import ljn.building
+from ljn import Pipeline
 from ljn.building import build
 from ljn.modules.joint_detector import JointDetector
 from ljn.runs import packages
@@ -247,8 +248,6 @@ def test_a_moved_class_is_one_that_a_config_may_name():
 
 @pytest.mark.parametrize("name", INDEX)
 def test_what_ships_loads(name):
-    from ljn import Pipeline
-
     assert Pipeline.from_pretrained(name).detector.recipe is not None
     assert packages.read_about((SHIPPED / f"{name}.safetensors").read_bytes(), name)["name"] == name
 

@@ -10,8 +10,11 @@ import pytest
 
 from ljn import Pipeline
 from ljn.body import load_body_model
+from ljn.body.files import _DATA_DIR
+from ljn.body.skeleton import PARENTS
 from ljn.runs import packages
 from ljn.runs.checkpoints import read_checkpoint
+from ljn.runs.keys import CONFIG_GROUPS
 from ljn.runs.packages import read_about
 from ljn.tasks.evaluate import evaluate
 from ljn.tasks.figures import figures
@@ -85,14 +88,8 @@ def test_a_package_names_no_place_on_the_machine(models, both):
     assert str(both.parent.parent) not in text
     assert str(ROOT) not in text
     assert about["stages"]["mesh"]["config"]["data"]["detector_ckpt"] is None
-    assert set(about["stages"]["mesh"]["config"]) == set(packages_groups())
+    assert set(about["stages"]["mesh"]["config"]) == set(CONFIG_GROUPS)
     assert read_checkpoint(both, stage="mesh").config["data"]["detector_ckpt"] == str(both)
-
-
-def packages_groups():
-    from ljn.runs.keys import CONFIG_GROUPS
-
-    return CONFIG_GROUPS
 
 
 def test_a_run_s_record_goes_into_its_package(trained, smoke_config, tmp_path):
@@ -175,13 +172,11 @@ def test_what_a_package_needs_is_named(change, message, smoke_config, tmp_path):
 
 
 def test_the_body_of_licensed_weights_is_given(write_checkpoint, models, image, kinect, tmp_path):
-    from ljn.body.files import _DATA_DIR
-
     for gender in ("female", "male"):
         shutil.copy(_DATA_DIR / f"{gender}.npz", tmp_path)
     changed = load_body_model()
     arrays = {name: getattr(changed, name) for name in ("shapedirs", "posedirs", "J_regressor", "weights")}
-    table = np.array([[2**32 - 1, *parents()], range(24)])
+    table = np.array([[2**32 - 1, *PARENTS[1:]], range(24)])
     body = tmp_path / "neutral.npz"
     np.savez(body, **arrays, v_template=1.01 * changed.v_template, f=changed.faces, kintree_table=table)
     mesh = write_checkpoint("mesh/kinematic", "model.channels=16", f"body.path={tmp_path}")
@@ -194,12 +189,6 @@ def test_the_body_of_licensed_weights_is_given(write_checkpoint, models, image, 
     assert prediction.vertices.shape == (6890, 3)
     with pytest.raises(ValueError, match=r"the body found here is .*; give the training's body file"):
         Pipeline.load(models[0], mesh, body_path=_DATA_DIR / "neutral.npz")
-
-
-def parents():
-    from ljn.body.skeleton import PARENTS
-
-    return PARENTS[1:]
 
 
 _ELSEWHERE = """
