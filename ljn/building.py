@@ -24,6 +24,21 @@ _FOREIGN_BASES = {
 _ALLOWED = (*OWN_MODULES, *_FOREIGN_BASES)
 
 
+MOVED: dict[str, str] = {}
+"""Where a class that a config may name was once, and where it is now: what was trained outlives a move."""
+
+
+def with_moved_targets(config: Any) -> Any:
+    """A plain config with every `_target_` that has moved (see `MOVED`) under its new import path."""
+    if isinstance(config, Mapping):
+        moved = {key: with_moved_targets(value) for key, value in config.items()}
+        target = moved.get("_target_")
+        return moved | {"_target_": MOVED[target]} if isinstance(target, str) and target in MOVED else moved
+    if isinstance(config, list):
+        return [with_moved_targets(value) for value in config]
+    return config
+
+
 def check_targets(config: Any, where: str = "") -> None:
     """Raise a `ValueError` if any `_target_` in a plain config names something outside the allow-list.
 

@@ -21,6 +21,13 @@ def import_open3d() -> Any:
     return _import("open3d", fix)
 
 
+def import_huggingface_hub() -> Any:
+    """The `huggingface_hub` module; an `ImportError` where it is missing."""
+    return _import(
+        "huggingface_hub", "huggingface_hub` (the extra `hub`); or give a package's file, NAME.safetensors"
+    )
+
+
 def import_pyrender() -> Any:
     """The `pyrender` module, set up to draw through EGL, without a display; an `ImportError` as `import_open3d`."""
     # pyrender reads these when it is imported; what the user has chosen stays.

@@ -17,6 +17,7 @@ from ljn.modules.mesh_regressor import MeshRegressor
 from ljn.pipeline.depth import body_depth
 from ljn.pipeline.keypoints import MIN_KNOWN, check_place, smpl_keypoints
 from ljn.runs.checkpoints import Checkpoint, load_module
+from ljn.runs.packages import DEFAULT, find_package, stages_of
 
 _SEED = 0  # of the choice of points: the same for every image, so that equal input gives equal output
 
@@ -114,13 +115,16 @@ class Pipeline:
         detector_ckpt: str | Path,
         mesh_ckpt: str | Path | None = None,
         device: str | torch.device = "cpu",
+        body_path: str | Path | None = None,
     ) -> Self:
         """The pipeline of two checkpoints.
 
         Args:
-            detector_ckpt: A joint detector's.
-            mesh_ckpt: A mesh regressor's; None predicts joints alone.
+            detector_ckpt: A joint detector's checkpoint, or a package's file.
+            mesh_ckpt: A mesh regressor's, or a package's file; None predicts joints alone.
             device: Where the networks run.
+            body_path: File or folder of the body whose mesh is predicted, for weights trained on bodies that are not
+                embedded; None: where it was in the training.
 
         Raises:
             FileNotFoundError: There is no such file.
@@ -130,7 +134,7 @@ class Pipeline:
         detector = _stage(module.to(device), checkpoint)
         if mesh_ckpt is None:
             return cls(detector)
-        module, mesh_checkpoint = load_module(mesh_ckpt, MeshRegressor, "mesh_ckpt")
+        module, mesh_checkpoint = load_module(mesh_ckpt, MeshRegressor, "mesh_ckpt", body_path)
         if unknown := mesh_checkpoint.unknown_bodies(checkpoint.body_hash.split("-")):
             raise ValueError(
                 f"mesh_ckpt: '{mesh_ckpt}' was trained with the bodies {mesh_checkpoint.body_hash}, and {unknown[0]} "
@@ -140,10 +144,33 @@ class Pipeline:
         if unknown := mesh_checkpoint.unknown_bodies(module.body_hashes):
             raise ValueError(
                 f"mesh_ckpt: '{mesh_ckpt}' was trained with the bodies {mesh_checkpoint.body_hash}, but the body found "
-                f"here is {unknown[0]}; put the training's body file in its place, or use the version of this library "
-                "whose embedded body it was"
+                f"here is {unknown[0]}; give the training's body file (body.path=FILE, in Python body_path=FILE), or "
+                "use the version of this library whose embedded body it was"
             )
         return cls(detector, _stage(module.to(device), mesh_checkpoint))
+
+    @classmethod
+    def from_pretrained(
+        cls,
+        name: str | Path = DEFAULT,
+        device: str | torch.device = "cpu",
+        body_path: str | Path | None = None,
+    ) -> Self:
+        """The pipeline of trained weights that ship in one file, a package.
+
+        Args:
+            name: Of weights that come with the library; a package's file; or a repository of the Hugging Face hub. See
+                `find_package`.
+            device: See `load`.
+            body_path: See `load`.
+
+        Raises:
+            FileNotFoundError: There is no such file.
+            ValueError: There are no such weights, or see `load`.
+            ImportError: They are on the hub, and `huggingface_hub` is missing.
+        """
+        path = find_package(name, "name")
+        return cls.load(path, path if "mesh" in stages_of(path, "name") else None, device, body_path)
 
     @property
     def needs_keypoints(self) -> bool:

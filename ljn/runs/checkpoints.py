@@ -14,12 +14,13 @@ from lightning.pytorch.plugins.io import TorchCheckpointIO
 from torch import Tensor
 from torch.nn.modules.module import register_module_parameter_registration_hook
 
-from ljn.building import build, check_targets
+from ljn.building import build, check_targets, with_moved_targets
 from ljn.cloud.observation import ObservationRecipe
 from ljn.geometry.camera import Camera
 from ljn.modules.base import StageModule
 from ljn.reading import READ_ERRORS, brief, check_archive, plain_values, reason, shown
 from ljn.runs.keys import CONFIG_GROUPS
+from ljn.runs.packages import is_package, read_stage
 
 CHECKPOINT_VERSION = 3
 _PROVENANCE_KEY = "ljn"
@@ -79,7 +80,7 @@ class AtomicCheckpointIO(TorchCheckpointIO):
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """A checkpoint of this library."""
+    """A checkpoint of this library, or a stage of a package."""
 
     path: Path  # the file
     config: dict[str, Any]  # the resolved configuration that the model was trained with
@@ -97,12 +98,19 @@ class Checkpoint:
         return sorted(set(hashes) - set(self.body_hash.split("-")))
 
 
-def read_checkpoint(path: str | Path, name: str = "ckpt_path") -> Checkpoint:
-    """Read a checkpoint; errors call its argument `name`.
+def read_checkpoint(path: str | Path, name: str = "ckpt_path", stage: str = "detector") -> Checkpoint:
+    """Read a checkpoint, or a stage of a package; errors call its argument `name`.
+
+    The configuration of a package's mesh regressor names that package's detector, to be tested on its joints.
+
+    Args:
+        path: A checkpoint, or a package (`NAME.safetensors`).
+        name: The argument's name.
+        stage: Which stage of a package; a checkpoint is of one.
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: It is damaged, not a checkpoint of this library, or of a newer version.
+        ValueError: It is damaged, not a checkpoint of this library, of a newer version, or has no such stage.
     """
     path = Path(path)
     if not path.is_file():
@@ -111,17 +119,13 @@ def read_checkpoint(path: str | Path, name: str = "ckpt_path") -> Checkpoint:
         )
     try:
         data = path.read_bytes()
-        check_archive(data)
-        content = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
-    except READ_ERRORS as error:
-        raise ValueError(
-            f"{name}: '{path}' is damaged, truncated or no checkpoint at all ({reason(error)}); copy it again, or "
-            "use another one of the run"
-        ) from error
+    except OSError as error:
+        raise ValueError(f"{name}: '{path}' cannot be read ({reason(error)})") from error
+    content = _content(path, data, name, stage)
     provenance: Any = content.get(_PROVENANCE_KEY) if isinstance(content, dict) else None
     if not _is_ours(content, provenance):
         raise ValueError(
-            f"{name}: '{path}' is a PyTorch file, but no checkpoint that a run of this library wrote: it "
+            f"{name}: '{path}' is a file of weights, but no checkpoint that a run of this library wrote: it "
             "carries no whole configuration"
         )
     if provenance["version"] != CHECKPOINT_VERSION:
@@ -136,7 +140,8 @@ def read_checkpoint(path: str | Path, name: str = "ckpt_path") -> Checkpoint:
     try:
         checkpoint = Checkpoint(
             path=path,
-            **{key: provenance[key] for key in ("config", "body_hash", "data_licence", "run")},
+            config=with_moved_targets(provenance["config"]),
+            **{key: provenance[key] for key in ("body_hash", "data_licence", "run")},
             epoch=content["epoch"] + 1,
             recipe=None if recipe is None else ObservationRecipe(**recipe),
             state=dict(content["state_dict"]),
@@ -149,6 +154,34 @@ def read_checkpoint(path: str | Path, name: str = "ckpt_path") -> Checkpoint:
             f"{name}: '{path}': {reason(error, 1000)}; use another checkpoint of the run"
         ) from error
     return checkpoint
+
+
+def _content(path: Path, data: bytes, name: str, stage: str) -> Any:
+    """What a checkpoint's file holds, or a package's for a stage, in a checkpoint's form."""
+    if is_package(path):
+        about, state = read_stage(data, stage, f"{name}: '{path}'")
+        settings = about["config"].get("data") if isinstance(about.get("config"), dict) else None
+        if stage != "detector" and isinstance(settings, dict) and "detector_ckpt" in settings:
+            settings["detector_ckpt"] = str(path)
+        return {_PROVENANCE_KEY: about, "epoch": about.get("epoch"), "state_dict": state}
+    try:
+        check_archive(data)
+        return torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
+    except READ_ERRORS as error:
+        raise ValueError(
+            f"{name}: '{path}' is damaged, truncated or no checkpoint at all ({reason(error)}); copy it again, or "
+            "use another one of the run"
+        ) from error
+
+
+def for_package(checkpoint: Checkpoint, config: dict[str, Any], training: dict[str, Any]) -> dict[str, Any]:
+    """What a package says of a checkpoint, as `read_checkpoint` reads it, with a configuration fit to leave the machine
+    and a record of the training.
+    """
+    provenance = Provenance(
+        config, checkpoint.body_hash, checkpoint.data_licence, checkpoint.run, checkpoint.recipe
+    )
+    return {**provenance.content, "epoch": checkpoint.epoch - 1, "training": training}
 
 
 def _is_ours(content: Any, provenance: Any) -> bool:
@@ -252,16 +285,34 @@ def load_state(module: torch.nn.Module, checkpoint: Checkpoint, argument: str = 
     module.load_state_dict(checkpoint.state)
 
 
-def load_module(path: str | Path, kind: type[StageModule], name: str = "ckpt_path") -> tuple[Any, Checkpoint]:
-    """The trained module of a checkpoint, of the class `kind`, in evaluation mode; and the checkpoint.
+def load_module(
+    path: str | Path,
+    kind: type[StageModule],
+    name: str = "ckpt_path",
+    body_path: str | Path | None = None,
+) -> tuple[Any, Checkpoint]:
+    """The trained module of a checkpoint or a package, in evaluation mode; and the checkpoint.
+
+    Args:
+        path: See `read_checkpoint`.
+        kind: The module's class.
+        name: What errors call the path's argument.
+        body_path: File or folder of the body that the module predicts, to predict alone; None: as in its training.
 
     Raises:
         FileNotFoundError: There is no such file.
         ValueError: See `read_checkpoint` and `load_state`; or the checkpoint is of another kind.
     """
-    checkpoint = read_checkpoint(path, name)
+    checkpoint = read_checkpoint(path, name, kind.stage)
+    config = checkpoint.config["module"]
+    if body_path is not None and "predicted" in config:
+        config = config | {"body_path": str(body_path), "genders": [config["predicted"]]}
     try:
-        module = build(checkpoint.config["module"])
+        module = build(config)
+    except FileNotFoundError as error:
+        raise FileNotFoundError(
+            f"{name}: '{path}': {error}; its place is body.path=FILE, in Python body_path=FILE"
+        ) from error
     except ValueError as error:
         raise ValueError(f"{name}: '{path}': {error}") from error
     if not isinstance(module, kind):

@@ -21,11 +21,16 @@ def write_json(path: Path, content: Mapping[str, Any]) -> None:
 
 
 def write_text_atomically(path: Path, text: str) -> None:
-    """Write a text file, whole or not at all: after a failure the old file is unchanged and no draft is left."""
+    """Write a text file; see `write_atomically`."""
+    write_atomically(path, text.encode())
+
+
+def write_atomically(path: Path, data: bytes) -> None:
+    """Write a file, whole or not at all: after a failure the old file is unchanged and no draft is left."""
     # Jobs side by side write the same files, each in a process of its own.
     draft = path.with_name(f"{path.name}.{os.getpid()}.tmp")
     try:
-        draft.write_text(text, encoding="utf-8")
+        draft.write_bytes(data)
         draft.replace(path)
     finally:
         draft.unlink(missing_ok=True)

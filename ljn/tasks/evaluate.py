@@ -1,4 +1,4 @@
-"""`task=evaluate`: test a checkpoint, with nothing but the checkpoint."""
+"""`task=evaluate`: test a checkpoint or a package, with nothing but that."""
 
 import logging
 from pathlib import Path
@@ -12,8 +12,10 @@ from ljn.runs import layout
 from ljn.runs.checkpoints import Checkpoint, load_state, read_checkpoint
 from ljn.runs.files import read_metrics, write_json
 from ljn.runs.identity import config_hash, identity
+from ljn.runs.packages import STAGES
 from ljn.runs.record import RunRecord, alone_in, is_complete
 from ljn.tasks.overrides import check_bodies, typed_overrides, with_checkpoint_config
+from ljn.tasks.package import chosen_package
 from ljn.tasks.running import build_trainer, finite_metrics, prepare_process, save_config, set_run_directory
 from ljn.tasks.tracking import tracking
 from ljn.tasks.validation import validate
@@ -25,32 +27,43 @@ def evaluate(cfg: DictConfig) -> dict[str, float]:
     """Test a checkpoint on its own data, or on data changed by this call's overrides.
 
     Args:
-        cfg: The composed configuration, whose `ckpt_path` names the checkpoint. Model, data and trainer come
-            from the checkpoint; of this call's overrides, those of single values of data, trainer and body
-            are applied to them.
+        cfg: The composed configuration, whose `ckpt_path` names the checkpoint; or `weights` a package and `task.stage`
+            its stage, of which a mesh regressor is tested on the joints of the package's detector. Model, data and
+            trainer come from the checkpoint; of this call's overrides, those of single values of data, trainer and
+            body are applied to them.
 
     Returns:
         The test metrics, also in `metrics.json` of the evaluation's directory.
 
     Raises:
         FileNotFoundError: There is no such checkpoint.
-        ValueError: `ckpt_path` is not set; the checkpoint is damaged, or belongs to another model or body; or
-            an override changes what the checkpoint decides.
+        ValueError: Of `ckpt_path` and `weights` not one is set; the checkpoint is damaged, or belongs to another model
+            or body; or an override changes what the checkpoint decides.
     """
-    if cfg.ckpt_path is None:
-        raise ValueError("ckpt_path: expected the checkpoint to evaluate, got null; add ckpt_path=FILE")
-    return evaluate_checkpoint(cfg, cfg.ckpt_path, typed_overrides())
+    if cfg.task.stage not in STAGES:
+        raise ValueError(f"task.stage: expected one of {', '.join(STAGES)}, got {cfg.task.stage!r}")
+    path = chosen_package(cfg, "ckpt_path") or cfg.ckpt_path
+    if path is None:
+        raise ValueError(
+            "ckpt_path: expected the checkpoint to evaluate, got null; add ckpt_path=FILE, or weights=NAME"
+        )
+    return evaluate_checkpoint(cfg, path, typed_overrides(), stage=cfg.task.stage)
 
 
 def evaluate_checkpoint(
-    cfg: DictConfig, path: str | Path, overrides: list[str], name: str | None = None, reuses: bool = False
+    cfg: DictConfig,
+    path: str | Path,
+    overrides: list[str],
+    name: str | None = None,
+    reuses: bool = False,
+    stage: str = "detector",
 ) -> dict[str, float]:
-    """Test a checkpoint, with overrides of single values, as they would be typed; see `evaluate`.
+    """Test a checkpoint or a package's stage, with overrides of single values, as they would be typed; see `evaluate`.
 
     Sets `paths.run_dir` of the call's configuration. The evaluation has the checkpoint's name or `name`; with `reuses`,
     an equal evaluation, if there is a complete one, is taken instead.
     """
-    checkpoint = read_checkpoint(path)
+    checkpoint = read_checkpoint(path, stage=stage)
     call, cfg = cfg, with_checkpoint_config(cfg, checkpoint, overrides)
     cfg.name = name or cfg.name
     validate(cfg)

@@ -17,7 +17,9 @@ from ljn.modules.joint_detector import JointDetector
 from ljn.modules.mesh_regressor import MeshRegressor
 from ljn.runs.checkpoints import load_module
 from ljn.runs.files import write_json
+from ljn.runs.packages import stages_of
 from ljn.tasks.overrides import check_bodies, typed_overrides, with_checkpoint_config
+from ljn.tasks.package import chosen_package
 from ljn.tasks.running import prepare_process
 from ljn.tasks.validation import check_writable, validate
 
@@ -41,10 +43,11 @@ def figures(cfg: DictConfig) -> dict[str, float]:
     the test set, not chosen by hand; `figures.json` names them, with their errors and the checkpoints.
 
     Args:
-        cfg: The composed configuration; of it `task`, `paths` and `num_threads` count, and of what was typed, what
-            changes the checkpoints' data, as with `task=evaluate`. `task.detectors` and
-            `task.regressors` are lists of checkpoints; `task.keypoint_noise_px` gives the noise of each detector's
-            keypoints (null: that of its training); `task.num_samples` says how many samples to draw.
+        cfg: The composed configuration; of it `task`, `weights`, `paths` and `num_threads` count, and of what was
+            typed, what changes the checkpoints' data, as with `task=evaluate`. `task.detectors` and `task.regressors`
+            are lists of checkpoints, after which the package comes that `weights` names; `task.keypoint_noise_px`
+            gives the noise of each detector's keypoints (null: that of its training); `task.num_samples` says how many
+            samples to draw.
 
     Returns:
         The mean error of the drawn samples in each column, as `figures/joints_0` and so on, mm: MPJPE (root-aligned
@@ -55,6 +58,9 @@ def figures(cfg: DictConfig) -> dict[str, float]:
         FileNotFoundError: There is no such checkpoint.
     """
     detectors, regressors = list(cfg.task.detectors), list(cfg.task.regressors)
+    if (package := chosen_package(cfg)) is not None:
+        detectors.append(str(package))
+        regressors += [str(package)] * ("mesh" in stages_of(package))
     if not detectors and not regressors:
         raise ValueError(
             "task.detectors, task.regressors: expected checkpoints, got none; python run.py task=figures "

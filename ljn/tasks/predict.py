@@ -20,11 +20,14 @@ from ljn.pipeline.pictures import draw_prediction
 from ljn.pipeline.pipeline import Pipeline, Prediction
 from ljn.pipeline.writing import write_arrays, write_mesh
 from ljn.runs.files import path_part, write_json
+from ljn.runs.packages import DEFAULT, shipped
+from ljn.tasks.package import chosen_package
 from ljn.tasks.validation import check_writable
 
 _LOG = logging.getLogger(__name__)
-_NEEDED = ("task.input", "task.camera", "ckpt_path")
-_OPTIONAL = ("task.keypoints", "task.mask", "task.mesh_ckpt_path")
+_NEEDED = ("task.input", "task.camera")
+_CHECKPOINTS = ("ckpt_path", "task.mesh_ckpt_path")
+_OPTIONAL = ("task.keypoints", "task.mask")
 _COMMAND = (
     "python run.py task=predict task.input=DEPTH.png task.camera=CAMERA.yaml task.keypoints=KEYPOINTS.json "
     "ckpt_path=DETECTOR.ckpt task.mesh_ckpt_path=MESH.ckpt"
@@ -38,8 +41,9 @@ def predict(cfg: DictConfig) -> dict[str, float]:
     each frame's outcome.
 
     Args:
-        cfg: The composed configuration; of it `task`, `ckpt_path`, `paths`, `num_threads` and `trainer.accelerator`
-            count.
+        cfg: The composed configuration; of it `task`, `ckpt_path`, `weights`, `body.path`, `paths`, `num_threads` and
+            `trainer.accelerator` count. With neither checkpoints nor `weights`, the default weights are taken, if any
+            ship.
 
     Returns:
         `predict/frames`, and with a mesh regressor `predict/median_distance_mm`: the median over the frames of the
@@ -50,9 +54,13 @@ def predict(cfg: DictConfig) -> dict[str, float]:
         ValueError: The input or a checkpoint is wrong; or a frame of a folder is, after all others are written.
     """
     task = cfg.task
-    values = {key: OmegaConf.select(cfg, key) for key in _NEEDED + _OPTIONAL}
+    values = {key: OmegaConf.select(cfg, key) for key in _NEEDED + _OPTIONAL + _CHECKPOINTS}
+    if cfg.weights is None and not any(values[key] for key in _CHECKPOINTS) and DEFAULT in shipped():
+        cfg.weights = DEFAULT
+    package = chosen_package(cfg, *_CHECKPOINTS)
+    needed = _NEEDED if package else (*_NEEDED, "ckpt_path")
     for key, value in values.items():
-        if not isinstance(value, str) and (key in _NEEDED or value is not None):
+        if not isinstance(value, str) and (key in needed or value is not None):
             got = "null" if value is None else f"{value!r}, no text: write '{key}=\"PATH\"'"
             raise ValueError(f"{key}: expected a path, got {got}; {_COMMAND}")
     camera = read_camera(task.camera)
@@ -62,11 +70,15 @@ def predict(cfg: DictConfig) -> dict[str, float]:
     if cfg.num_threads is not None:
         torch.set_num_threads(cfg.num_threads)
     use_gpu = cfg.trainer.accelerator != "cpu" and torch.cuda.is_available()
-    pipeline = Pipeline.load(cfg.ckpt_path, task.mesh_ckpt_path, "cuda" if use_gpu else "cpu")
+    device = "cuda" if use_gpu else "cpu"
+    if package:
+        pipeline = Pipeline.from_pretrained(package, device, cfg.body.path)
+    else:
+        pipeline = Pipeline.load(cfg.ckpt_path, task.mesh_ckpt_path, device, cfg.body.path)
     if task.keypoints is None and pipeline.needs_keypoints:
         raise ValueError(
-            f"task.keypoints: expected a path, since the detector '{cfg.ckpt_path}' takes keypoints, got null; "
-            f"{_COMMAND}, or a detector that can do without: experiment=detector/cascade"
+            f"task.keypoints: expected a path, since the detector '{package or cfg.ckpt_path}' takes keypoints, got "
+            f"null; {_COMMAND}, or a detector that can do without: experiment=detector/cascade"
         )
 
     results = _predict(pipeline, frames, camera, directory, may_fail=Path(task.input).is_dir())

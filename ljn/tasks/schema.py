@@ -16,6 +16,7 @@ class Config:
     seed: int = 0
     num_threads: int | None = None
     ckpt_path: str | None = None
+    weights: str | None = None
     rerun: bool = False
     tables: list[str] = field(default_factory=list)
     optimized_metric: str = "val/mpjpe"

@@ -35,10 +35,11 @@ def train(cfg: DictConfig) -> dict[str, float]:
         FileNotFoundError: A file that it names is missing.
         FloatingPointError: The loss or a metric is not finite.
     """
-    if cfg.ckpt_path is not None:
-        raise ValueError(
-            "ckpt_path: it is what task=evaluate reads; a training resumes from its own directory by itself"
-        )
+    for key in ("ckpt_path", "weights"):
+        if cfg[key] is not None:
+            raise ValueError(
+                f"{key}: it is what task=evaluate reads; a training resumes from its own directory by itself"
+            )
     validate(cfg)
     initial = _earlier_stages(cfg)
     datamodule: DataModule = build(cfg.data)
@@ -109,6 +110,7 @@ def _train(
     facts = {
         "name": cfg.name,
         "preset": cfg.preset.name,
+        "overrides": typed_overrides(),
         "config_hash": identity_hash,
         "begins_with": None if initial is None else {"path": str(initial.path), "hash": initial.file_hash},
         "data": datamodule.describe(),

@@ -18,7 +18,7 @@ def test_the_names_of_a_run_s_files_stand_once():
         for name in NAMES
         if f'"{name}"' in path.read_text() and path.name != "layout.py"
     ]
-    assert len(NAMES) == 12
+    assert len(NAMES) == 13
     assert literal == []
 
 
