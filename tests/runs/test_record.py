@@ -75,15 +75,15 @@ def test_a_signal_leaves_a_valid_record_and_the_exit_code_that_shells_expect(
 
 
 def test_a_full_disk_leaves_the_old_file_no_draft_and_the_first_error(tmp_path, monkeypatch, caplog):
-    write = Path.write_text
+    write = Path.write_bytes
 
-    def half(path, text, **options):
-        write(path, text[: len(text) // 2], **options)
+    def half(path, data):
+        write(path, data[: len(data) // 2])
         raise OSError(errno.ENOSPC, "No space left on device")
 
     write_json(tmp_path / "metrics.json", {"a": 1})
     record = RunRecord(tmp_path, {}).__enter__()
-    monkeypatch.setattr(Path, "write_text", half)
+    monkeypatch.setattr(Path, "write_bytes", half)
     for write_something in (lambda: write_json(tmp_path / "metrics.json", {"a": 2}), record.__enter__):
         with pytest.raises(OSError, match="No space left"):
             write_something()
