@@ -7,9 +7,13 @@ from pathlib import Path
 
 from hydra.core.override_parser.types import Quote, QuotedString
 
-_OF_PREDICT = ("input", "camera", "keypoints", "mask", "mesh_ckpt_path")
+_SHORT = {
+    **dict.fromkeys(("input", "camera", "keypoints", "mask"), ("task=predict",)),
+    "mesh_ckpt_path": ("task=predict", "task=demo"),
+}
+"""Keys of tasks that may be typed without their `task.`, and the tasks that they are of."""
 _PATHS = (
-    *(f"task.{name}" for name in (*_OF_PREDICT, "directory")),
+    *(f"task.{name}" for name in (*_SHORT, "directory")),
     *("ckpt_path", "paths.output_dir", "paths.cache_dir", "body.path", "data.source.path"),
     *("data.source.split_path", "data.detector_ckpt"),
 )
@@ -20,20 +24,24 @@ _NOT_BARE = re.compile(r"""$|null$|['"\[]|.*\$\{|.*,|(choice|glob|tag)\(""")
 def prepare_arguments(arguments: Sequence[str]) -> list[str]:
     """A command line's arguments with every path in quotes, as Hydra needs it for `2023_04_01` or `a=b`.
 
-    Paths that begin with `~` are those of the user's home. With `task=predict`, its keys may be typed without their
+    Paths that begin with `~` are those of the user's home. The keys of `task=predict` may be typed without their
     `task.`, as in `input=DEPTH.png`.
 
     Raises:
-        ValueError: A key of `task=predict` is given to another task.
+        ValueError: Such a key is given to another task.
     """
-    return [_prepare(argument, "task=predict" in arguments) for argument in arguments]
+    return [_prepare(argument, arguments) for argument in arguments]
 
 
-def _prepare(argument: str, is_predict: bool) -> str:
+def _prepare(argument: str, arguments: Sequence[str]) -> str:
     key, equals, value = argument.partition("=")
-    if key in _OF_PREDICT and equals:
-        if not is_predict:
-            raise ValueError(f"{key}: only task=predict reads this; add task=predict, or leave it out")
+    if key in _SHORT and equals:
+        tasks = _SHORT[key]
+        if not set(tasks) & set(arguments):
+            reads = "reads" if len(tasks) == 1 else "read"
+            raise ValueError(
+                f"{key}: only {' and '.join(tasks)} {reads} this; add {tasks[0]}, or leave it out"
+            )
         key = f"task.{key}"
         argument = f"{key}={value}"
     path = os.path.expanduser(value)
