@@ -9,7 +9,7 @@ import torch
 from ljn.body.skeleton import ROOT
 from ljn.drawing import FROM_THE_SIDE, new_figure
 from ljn.geometry.camera import Camera
-from ljn.pipeline.pictures import MESH
+from ljn.pipeline.pictures import MESH, NEAREST_M
 from ljn.pipeline.pipeline import Prediction
 from ljn.render import get_renderer
 from ljn.render.shading import shade_mesh
@@ -25,7 +25,7 @@ _OPACITY = 0.82
 _DOT_PX = 1.1  # radius of a point of the cloud
 _SEEN_M = 0.02  # a point this far behind the surface is still seen
 _INK, _FAINT, _LINE = "#20242a", "#6b7480", "#dde1e6"
-_GIF_PX = (360, 480)
+_GIF_PX = 420  # the longer side
 _GIF_FRAME_MS = 90
 _GIF_COLOURS = 96
 _TILT = np.deg2rad(12)
@@ -70,6 +70,7 @@ def draw_overview(panels: list[Panel]) -> "Figure":
             page[y : y + image.shape[0], x : x + image.shape[1]] = image
 
     figure = new_figure(width / 100, height / 100)
+    figure.set_layout_engine("none")
     axis = figure.add_axes((0, 0, 1, 1))
     axis.imshow(page, interpolation="none", aspect="auto", extent=(0, width, height, 0))
     axis.set_axis_off()
@@ -93,11 +94,12 @@ def _depth(panel: Panel) -> np.ndarray:
 def _over_depth(panel: Panel) -> np.ndarray:
     """The mesh over the depth image in grey."""
     vertices, faces = _mesh(panel.prediction)
-    camera = _magnifying(panel)
-    colours = shade_mesh(vertices, faces, camera, MESH, background=np.nan)
-    is_mesh = np.isfinite(colours[..., 0])
     is_body = _magnified(panel, panel.depth > 0)
-    grey = np.where(is_body, 0.45 + 0.4 * (1 - _magnified(panel, _nearness(panel.depth, panel.depth))), 1.0)
+    colours = np.full((*is_body.shape, 3), np.nan)
+    if vertices[:, 2].min() > NEAREST_M:
+        colours = shade_mesh(vertices, faces, _magnifying(panel), MESH, background=np.nan)
+    is_mesh = np.isfinite(colours[..., 0])
+    grey = np.where(is_body, 0.45 + 0.4 * (1 - _magnified(panel, _remoteness(panel.depth, panel.depth))), 1.0)
     over = _OPACITY * colours + (1 - _OPACITY) * grey[..., None]
     return _shrunk(np.where(is_mesh[..., None], over, grey[..., None]), is_mesh | is_body)
 
@@ -107,7 +109,8 @@ def _from_the_side(panel: Panel) -> np.ndarray:
     distance = max(float(panel.prediction.joints[ROOT, 2]), 2.0)
     side = round(2.6 * _PX_PER_METRE * _SUBPIXELS)
     camera = _centred(_PX_PER_METRE * _SUBPIXELS * distance, side, side)
-    image, is_drawn = _turned(panel.prediction, FROM_THE_SIDE, distance, camera)
+    centre = panel.prediction.joints[ROOT]
+    image, is_drawn = _turned(panel.prediction, FROM_THE_SIDE, centre, distance, camera)
     return _shrunk(image, is_drawn)
 
 
@@ -116,63 +119,59 @@ def write_turntable(prediction: Prediction, path: Path, num_frames: int = 24) ->
     from PIL import Image
 
     vertices, _ = _mesh(prediction)
-    width, height = (_SUBPIXELS * size for size in _GIF_PX)
-    centred = vertices - prediction.joints[ROOT]
-    middle = (centred[:, 1].min() + centred[:, 1].max()) / 2
-    radius = np.hypot(centred[:, 0], centred[:, 2]).max()
-    distance = 3.0 + radius
-    # Room for the whole turn, nearest parts too.
-    focal = 0.94 * (distance - radius) * min(height / np.ptp(centred[:, 1]), width / (2 * radius))
-    camera = _centred(float(focal), width, height)
-    tilt = _rotation(0, _TILT)
-    frames = []
-    for angle in np.arange(num_frames) * (2 * np.pi / num_frames):
-        image, _ = _turned(prediction, tilt @ _rotation(1, angle), distance, camera, middle)
-        frames.append(Image.fromarray(_bytes(_halved(image))))
+    centre = (vertices.min(0) + vertices.max(0)) / 2
+    turns = [
+        _rotation(0, _TILT) @ _rotation(1, angle)
+        for angle in np.arange(num_frames) * (2 * np.pi / num_frames)
+    ]
+    distance = 2 * float(np.linalg.norm(vertices - centre, axis=1).max()) + 1
+    seen = np.stack([(vertices - centre) @ turn.T for turn in turns])
+    reach = np.abs(seen[..., :2] / (seen[..., 2:] + distance)).max((0, 1))
+    size = _GIF_PX * _SUBPIXELS
+    focal = 0.45 * size / float(reach.max())
+    width, height = (_SUBPIXELS * round(1.1 * 2 * focal * part / _SUBPIXELS) for part in reach.tolist())
+    camera = _centred(focal, width, height)
+    pictures = [_turned(prediction, turn, centre, distance, camera)[0] for turn in turns]
+    frames = [
+        Image.fromarray(np.rint(255 * np.clip(_joined(picture), 0, 1)).astype(np.uint8))
+        for picture in pictures
+    ]
     # One palette for all: colours that change from picture to picture flicker.
-    sheet = Image.fromarray(np.concatenate([np.asarray(frame) for frame in frames[:: max(1, num_frames // 6)]]))
+    sheet = Image.fromarray(np.concatenate([np.asarray(frame) for frame in frames]))
     palette = sheet.quantize(_GIF_COLOURS, method=Image.Quantize.MEDIANCUT)
     first, *others = (frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames)
     first.save(path, save_all=True, append_images=others, duration=_GIF_FRAME_MS, loop=0, optimize=True)
 
 
 def _turned(
-    prediction: Prediction, rotation: np.ndarray, distance: float, camera: Camera, middle_y: float = 0.0
+    prediction: Prediction, rotation: np.ndarray, centre: np.ndarray, distance: float, camera: Camera
 ) -> tuple[np.ndarray, np.ndarray]:
-    """A picture `(H, W, 3)` of mesh and cloud, turned about the root, and where something is drawn `(H, W)`.
-
-    `middle_y` is what comes into the middle of the picture, in metres below the root.
-    """
+    """A picture `(H, W, 3)` of mesh and cloud, turned about a centre, and where something is drawn `(H, W)`."""
     vertices, faces = _mesh(prediction)
-    centre = prediction.joints[ROOT] + np.array([0, middle_y, 0])
     before = np.array([0, 0, distance])
     mesh = (vertices - centre) @ rotation.T + before
     image = shade_mesh(mesh, faces, camera, MESH, background=np.nan)
-    is_mesh = np.isfinite(image[..., 0])
-    image = np.where(is_mesh[..., None], image, 1.0)
-    surface = get_renderer("zbuffer")(torch.from_numpy(mesh)[None], torch.from_numpy(faces), camera)[0].numpy()
+    is_drawn = np.isfinite(image[..., 0])
+    image[~is_drawn] = 1.0
+    surface = get_renderer("zbuffer")(torch.from_numpy(mesh)[None], torch.from_numpy(faces), camera)[
+        0
+    ].numpy()
     points = (prediction.points[:, :3] - centre) @ rotation.T + before
-    colours = _viridis(prediction.points[:, 2], prediction.points[:, 2])
-    u, v = (points[:, axis] / points[:, 2] * camera.fx + (camera.cx, camera.cy)[axis] for axis in (0, 1))
-    columns, rows = np.rint(u).astype(int), np.rint(v).astype(int)
-    reach = int(np.ceil(_DOT_PX * _SUBPIXELS))
-    is_drawn = is_mesh.copy()
-    nearest_last = np.argsort(-points[:, 2])
-    columns, rows, colours, z = columns[nearest_last], rows[nearest_last], colours[nearest_last], points[nearest_last, 2]
-    is_inside = (reach <= columns) & (columns < camera.width - reach) & (reach <= rows) & (rows < camera.height - reach)
-    columns, rows, colours, z = columns[is_inside], rows[is_inside], colours[is_inside], z[is_inside]
-    behind = surface[rows, columns]
-    is_seen = (behind == 0) | (z < behind + _SEEN_M)
-    columns, rows, colours = columns[is_seen], rows[is_seen], colours[is_seen]
-    offsets = [
-        (i, j)
-        for i in range(-reach, reach + 1)
-        for j in range(-reach, reach + 1)
-        if i * i + j * j <= (_DOT_PX * _SUBPIXELS) ** 2
-    ]
-    for i, j in offsets:
-        image[rows + i, columns + j] = colours
-        is_drawn[rows + i, columns + j] = True
+    pixels = points[:, :2] / points[:, 2:] * camera.fx + np.array([camera.cx, camera.cy])
+    columns, rows = np.rint(pixels).astype(int).T
+    radius = _DOT_PX * _SUBPIXELS
+    reach = int(radius)
+    is_seen = (reach <= columns) & (columns < camera.width - reach)
+    is_seen &= (reach <= rows) & (rows < camera.height - reach)
+    behind = surface[rows.clip(0, camera.height - 1), columns.clip(0, camera.width - 1)]
+    is_seen &= (behind == 0) | (points[:, 2] < behind + _SEEN_M)
+    order = np.argsort(-points[:, 2])  # the nearest last, over the others
+    order = order[is_seen[order]]
+    colours = _viridis(prediction.points[order, 2], prediction.points[:, 2])
+    for i, j in np.ndindex(2 * reach + 1, 2 * reach + 1):
+        if (i - reach) ** 2 + (j - reach) ** 2 <= radius**2:
+            place = rows[order] + i - reach, columns[order] + j - reach
+            image[place], is_drawn[place] = colours, True
     return image, is_drawn
 
 
@@ -212,15 +211,16 @@ def _shrunk(image: np.ndarray, is_shown: np.ndarray) -> np.ndarray:
     pad = _MARGIN_PX * _SUBPIXELS
     image = image[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
     more = [-size % _SUBPIXELS for size in image.shape[:2]]
-    return _halved(np.pad(image, ((0, more[0]), (pad, pad + more[1]), (0, 0)), constant_values=1.0))
+    return _joined(np.pad(image, ((0, more[0]), (pad, pad + more[1]), (0, 0)), constant_values=1.0))
 
 
-def _halved(image: np.ndarray) -> np.ndarray:
+def _joined(image: np.ndarray) -> np.ndarray:
+    """An image `(H, W, 3)` whose pixels are the means of an image's subpixels."""
     height, width = (size // _SUBPIXELS for size in image.shape[:2])
     return image.reshape(height, _SUBPIXELS, width, _SUBPIXELS, 3).mean((1, 3))
 
 
-def _nearness(depth: np.ndarray, body: np.ndarray) -> np.ndarray:
+def _remoteness(depth: np.ndarray, body: np.ndarray) -> np.ndarray:
     """0 at the nearest depth of a body, 1 at the farthest."""
     body = body[body > 0]
     return np.clip((depth - body.min()) / max(float(np.ptp(body)), 1e-6), 0, 1)
@@ -230,7 +230,7 @@ def _viridis(depth: np.ndarray, body: np.ndarray) -> np.ndarray:
     """Colours `(..., 3)` of depths, those of a body as in its picture; white where there is none."""
     from matplotlib import colormaps
 
-    return np.where((depth > 0)[..., None], colormaps["viridis"](_nearness(depth, body))[..., :3], 1.0)
+    return np.where((depth > 0)[..., None], colormaps["viridis"](_remoteness(depth, body))[..., :3], 1.0)
 
 
 def _centred(focal: float, width: int, height: int) -> Camera:
@@ -245,7 +245,3 @@ def _rotation(axis: int, angle: float) -> np.ndarray:
     rotation[first, first], rotation[second, second] = cos, cos
     rotation[first, second], rotation[second, first] = -sin, sin
     return rotation
-
-
-def _bytes(image: np.ndarray) -> np.ndarray:
-    return np.rint(255 * np.clip(image, 0, 1)).astype(np.uint8)

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 _INITIAL, _PREDICTED, _FILLED = "#8f9aa8", "#d62728", "#ff9f1c"
 MESH = (0.45, 0.62, 0.86)
 _MESH_OPACITY = 0.75
-_NEAREST_M = 0.1
+NEAREST_M = 0.1
 _BESIDE = Camera(fx=400, fy=400, cx=512, cy=512, width=1024, height=1024)
 
 
@@ -87,7 +87,7 @@ def _draw_meshes(
     vertices, faces = prediction.vertices, prediction.faces
     assert vertices is not None
     assert faces is not None
-    if vertices[:, 2].min() < _NEAREST_M:
+    if vertices[:, 2].min() < NEAREST_M:
         front.set_axis_off()
         side.set_axis_off()
         front.set_title("the mesh is not before the camera", fontsize=9, loc="left")

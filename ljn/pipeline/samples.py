@@ -52,8 +52,8 @@ class Truth(NamedTuple):
         body = SMPL(load_body_models(body_path, [self.gender])).double()
         if body.hash != self.body:
             raise ValueError(
-                f"body: the truth belongs to the {self.gender} body {self.body}, but the one found here is {body.hash}; "
-                "export the samples again, or name their bodies with body.path=FILE_OR_FOLDER"
+                f"body: the truth belongs to the {self.gender} body {self.body}, but the one found here is "
+                f"{body.hash}; export the samples again, or name their bodies with body.path=FILE_OR_FOLDER"
             )
         posed = body(*(torch.from_numpy(values).double()[None] for values in (self.pose, self.betas)))
         root = torch.from_numpy(self.joints[ROOT]).double()
@@ -137,7 +137,9 @@ def read_truth(path: str | Path) -> Truth:
     """
     path = Path(path)
     if not path.is_file():
-        raise FileNotFoundError(f"truth: no file '{path}'; python run.py task=export writes one for each sample")
+        raise FileNotFoundError(
+            f"truth: no file '{path}'; python run.py task=export writes one for each sample"
+        )
     try:
         arrays = read_arrays(path)
     except READ_ERRORS as error:

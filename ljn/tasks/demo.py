@@ -90,9 +90,13 @@ def demo(cfg: DictConfig) -> dict[str, float]:
         progress.update()
     table = _table(shown)
     write_text_atomically(directory / "table.md", table)
-    print(f"{table}\nin {directory}: overview.png, turntable.gif; a picture, the mesh (.glb) and arrays of each frame")
+    print(
+        f"{table}\nin {directory}: overview.png, turntable.gif; a picture, the mesh (.glb) and arrays of each frame"
+    )
     print(f"your own depth image: {_COMMAND_OF_PREDICT}")
-    print(f"frames of your choice: python run.py task=export; python run.py task=demo task.directory={export}")
+    print(
+        f"frames of your choice: python run.py task=export; python run.py task=demo task.directory={export}"
+    )
     print("networks of your own: make train-demo")
     return {}
 
@@ -105,14 +109,14 @@ def _pipeline(cfg: DictConfig) -> Pipeline:
     for key, value in given.items():
         if not isinstance(value, str):
             raise ValueError(
-                f"{key}: expected a path, got {value!r}; give both ckpt_path=DETECTOR.ckpt and mesh_ckpt_path=MESH.ckpt, or "
-                "neither for the weights that ship"
+                f"{key}: expected a path, got {value!r}; give both ckpt_path=DETECTOR.ckpt and "
+                "mesh_ckpt_path=MESH.ckpt, or neither for the weights that ship"
             )
     pipeline = Pipeline.load(cfg.ckpt_path, cfg.task.mesh_ckpt_path)
     if pipeline.needs_keypoints:
         raise ValueError(
-            f"ckpt_path: the detector '{cfg.ckpt_path}' takes keypoints, and the frames are predicted without them; give a "
-            "detector that can do without: experiment=detector/cascade"
+            f"ckpt_path: the detector '{cfg.ckpt_path}' takes keypoints, and the frames are predicted without them; "
+            "give a detector that can do without: experiment=detector/cascade"
         )
     return pipeline
 
@@ -167,23 +171,37 @@ def _panel(shown: Shown) -> Panel:
         shown.depth,
         shown.files.camera,
         title=shown.name,
-        subtitle=shown.files.name,
+        subtitle=shown.files.name.replace("_", " "),
         caption=f"joints {joints_mm:.0f} mm, mesh {vertices_mm:.0f} mm",
     )
 
 
 def _table(shown: list[Shown]) -> str:
     """The errors of all frames and their means, in Markdown."""
-    numbers = np.array([[*each.errors_mm, *each.errors_from_keypoints_mm, each.milliseconds] for each in shown])
+    numbers = np.array(
+        [[*each.errors_mm, *each.errors_from_keypoints_mm, each.milliseconds] for each in shown]
+    )
     rows = [
-        ["frame", "camera", "MPJPE, mm", "APVE, mm", "MPJPE with keypoints", "APVE with keypoints", "ms a frame"],
+        [
+            "frame",
+            "camera",
+            "MPJPE, mm",
+            "APVE, mm",
+            "MPJPE with keypoints",
+            "APVE with keypoints",
+            "ms a frame",
+        ],
         *([each.name, each.files.name, *_texts(row)] for each, row in zip(shown, numbers)),
         ["mean", "", *_texts(numbers.mean(0))],
     ]
     widths = [max(map(len, column)) for column in zip(*rows)]
-    rows.insert(1, [*("-" * width for width in widths[:2]), *("-" * (width - 1) + ":" for width in widths[2:])])
+    rows.insert(
+        1, [*("-" * width for width in widths[:2]), *("-" * (width - 1) + ":" for width in widths[2:])]
+    )
     return "".join(
-        "| " + " | ".join([*map(str.ljust, row[:2], widths[:2]), *map(str.rjust, row[2:], widths[2:])]) + " |\n"
+        "| "
+        + " | ".join([*map(str.ljust, row[:2], widths[:2]), *map(str.rjust, row[2:], widths[2:])])
+        + " |\n"
         for row in rows
     )
 

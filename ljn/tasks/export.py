@@ -42,12 +42,12 @@ def export(cfg: DictConfig) -> dict[str, float]:
     check_writable(directory, "task.directory")
     if others := sorted({path.stem for path in (directory / DEPTH).glob("*")} - set(names)):
         raise ValueError(
-            f"task.directory: '{directory}' holds other samples, such as '{others[0]}', perhaps of another camera; choose "
-            "an empty folder with task.directory=FOLDER"
+            f"task.directory: '{directory}' holds other samples, such as '{others[0]}', perhaps of another camera; "
+            "choose an empty folder with task.directory=FOLDER"
         )
     prepare_process(cfg)
     datamodule: DataModule = build(cfg.data)
-    datamodule.takes = ()
+    datamodule.takes = ("confidences",)
     datamodule.prepare_data()
     batch, depth = datamodule.examples(cfg.task.split, list(cfg.task.indices))
     if len(cameras := batch["camera"].unique(dim=0)) > 1:
@@ -58,12 +58,14 @@ def export(cfg: DictConfig) -> dict[str, float]:
     # The shortest decimal numbers that are these in float32: those of the configuration.
     height, width = depth.shape[1:]
     write_camera(directory, Camera(*(float(str(value)) for value in cameras[0].numpy()), width, height))
+    is_missing = batch["confidences"] == 0
     hashes = {body.gender: body.hash for body in datamodule.bodies}
     for number, name in enumerate(names):
         keypoints = batch["keypoints"][number].tolist()
-        if "confidences" in batch:
-            confidences = batch["confidences"][number].tolist()
-            keypoints = [[*row, confidence] for row, confidence in zip(keypoints, confidences)]
+        if is_missing.any():
+            keypoints = [
+                [*row, 1.0 - missing] for row, missing in zip(keypoints, is_missing[number].tolist())
+            ]
         gender = _GENDERS[int(batch["gender"][number])]
         truth = Truth(
             batch["joints"][number].numpy(),
@@ -92,5 +94,7 @@ def _names(task: Any) -> list[str]:
     if names is None:
         names = [f"{task.split}_{index}" for index in indices]
     if not isinstance(names, list) or len(set(map(str, names))) != len(indices):
-        raise ValueError(f"task.names: expected {len(indices)} different names, got {names!r}; or leave them out")
+        raise ValueError(
+            f"task.names: expected {len(indices)} different names, got {names!r}; or leave them out"
+        )
     return [path_part(str(name)) for name in names]
