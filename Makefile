@@ -1,11 +1,14 @@
-# make demo | test | lint | bench | install: each installs what it needs into .venv first.
+# make demo | train-demo | test | lint | bench | install: each installs what it needs into .venv first.
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test lint bench install clean
+.PHONY: demo train-demo test lint bench install clean
 
 demo: install
+	$(BIN)/python run.py task=demo
+
+train-demo: install
 	$(BIN)/python run.py sweep=demo
 
 test: install

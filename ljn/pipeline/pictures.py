@@ -15,9 +15,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _INITIAL, _PREDICTED, _FILLED = "#8f9aa8", "#d62728", "#ff9f1c"
-_MESH = (0.45, 0.62, 0.86)
+MESH = (0.45, 0.62, 0.86)
 _MESH_OPACITY = 0.75
-_NEAREST_M = 0.1
+NEAREST_M = 0.1
 _BESIDE = Camera(fx=400, fy=400, cx=512, cy=512, width=1024, height=1024)
 
 
@@ -87,12 +87,12 @@ def _draw_meshes(
     vertices, faces = prediction.vertices, prediction.faces
     assert vertices is not None
     assert faces is not None
-    if vertices[:, 2].min() < _NEAREST_M:
+    if vertices[:, 2].min() < NEAREST_M:
         front.set_axis_off()
         side.set_axis_off()
         front.set_title("the mesh is not before the camera", fontsize=9, loc="left")
         return
-    colours = shade_mesh(vertices, faces, camera, _MESH, background=np.nan)
+    colours = shade_mesh(vertices, faces, camera, MESH, background=np.nan)
     is_mesh = np.isfinite(colours[..., 0])
     body = depth[depth > 0]
     grey = np.where(depth > 0, 0.9 - 0.5 * (depth - body.min()) / max(float(np.ptp(body)), 1e-6), 1.0)
@@ -105,7 +105,7 @@ def _draw_meshes(
     root = prediction.joints[ROOT]
     distance = np.array([0, 0, max(root[2], 1.5)])
     turned = (vertices - root) @ FROM_THE_SIDE.T + distance
-    colours = shade_mesh(turned, faces, _BESIDE, _MESH)
+    colours = shade_mesh(turned, faces, _BESIDE, MESH)
     points = (prediction.points[:, :3] - root) @ FROM_THE_SIDE.T + distance
     pixels = points[:, :2] / points[:, 2:] * _BESIDE.fx + _BESIDE.cx
     side.imshow(colours)

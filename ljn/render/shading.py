@@ -39,9 +39,13 @@ def shade_mesh(
         torch.from_numpy(np.ascontiguousarray(vertices, dtype=np.float64))[None], torch.tensor(faces), camera
     )
     face_ids, shares = seen.face_ids[0].numpy(), seen.barycentrics[0].numpy()
+    is_mesh = face_ids >= 0
+    face_ids, shares = face_ids[is_mesh], shares[is_mesh]  # (S,), (S, 3)
     normal = (normals[faces[face_ids]] * shares[..., None]).sum(-2)
     normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
     light = np.clip(normal @ (_LIGHT / np.linalg.norm(_LIGHT)), 0, 1)
     albedo = np.broadcast_to(np.asarray(colour, np.float64), (len(faces), 3))[face_ids]
-    lit = albedo * (0.25 + 0.75 * light)[..., None]
-    return np.where((face_ids >= 0)[..., None], lit, background)
+    picture = np.empty((*is_mesh.shape, 3))
+    picture[:] = background
+    picture[is_mesh] = albedo * (0.25 + 0.75 * light)[..., None]
+    return picture

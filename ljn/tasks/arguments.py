@@ -9,7 +9,7 @@ from hydra.core.override_parser.types import Quote, QuotedString
 
 _SHORT = {
     **dict.fromkeys(("input", "camera", "keypoints", "mask"), ("task=predict",)),
-    "mesh_ckpt_path": ("task=predict", "task=package"),
+    "mesh_ckpt_path": ("task=predict", "task=demo", "task=package"),
 }
 """Keys of tasks that may be typed without their `task.`, and the tasks that they are of."""
 _PATHS = (
@@ -38,10 +38,9 @@ def _prepare(argument: str, arguments: Sequence[str]) -> str:
     if key in _SHORT and equals:
         tasks = _SHORT[key]
         if not set(tasks) & set(arguments):
-            reads = "reads" if len(tasks) == 1 else "read"
-            raise ValueError(
-                f"{key}: only {' and '.join(tasks)} {reads} this; add {tasks[0]}, or leave it out"
-            )
+            *first, last = tasks
+            named = f"{', '.join(first)} and {last} read" if first else f"{last} reads"
+            raise ValueError(f"{key}: only {named} this; add {tasks[0]}, or leave it out")
         key = f"task.{key}"
         argument = f"{key}={value}"
     path = os.path.expanduser(value)

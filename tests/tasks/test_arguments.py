@@ -58,7 +58,12 @@ def test_a_key_that_has_moved_is_named(run_py):
     assert done.returncode == 1
     assert done.stderr == "error: input: only task=predict reads this; add task=predict, or leave it out\n"
     assert prepare_arguments(["task=predict", "input=a=b.png"]) == ["task=predict", "task.input='a=b.png'"]
-    given = ["mesh_ckpt_path=a=b", "task=package"]
-    assert prepare_arguments(given) == ["task.mesh_ckpt_path='a=b'", "task=package"]
-    with pytest.raises(ValueError, match="mesh_ckpt_path: only task=predict and task=package read this"):
-        prepare_arguments(given[:1])
+
+
+def test_a_key_of_several_tasks_is_short_in_each():
+    for task in ("task=predict", "task=demo", "task=package"):
+        assert prepare_arguments([task, "mesh_ckpt_path=a=b"]) == [task, "task.mesh_ckpt_path='a=b'"]
+    with pytest.raises(
+        ValueError, match="mesh_ckpt_path: only task=predict, task=demo and task=package read this"
+    ):
+        prepare_arguments(["task=train", "mesh_ckpt_path=x"])
