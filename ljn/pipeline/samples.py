@@ -147,5 +147,5 @@ def read_truth(path: str | Path) -> Truth:
     shapes = {name: value.shape for name, value in arrays.items()}
     if shapes != _SHAPES:
         raise ValueError(f"truth: expected the arrays {_SHAPES} in '{path}', got {shapes}")
-    texts = {name: str(arrays.pop(name)) for name in ("gender", "body")}
-    return Truth(**arrays, **texts)
+    gender, body = (str(arrays[name]) for name in ("gender", "body"))
+    return Truth(arrays["joints"], arrays["pose"], arrays["betas"], gender, body)

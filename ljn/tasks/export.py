@@ -57,7 +57,8 @@ def export(cfg: DictConfig) -> dict[str, float]:
         )
     # The shortest decimal numbers that are these in float32: those of the configuration.
     height, width = depth.shape[1:]
-    write_camera(directory, Camera(*(float(str(value)) for value in cameras[0].numpy()), width, height))
+    fx, fy, cx, cy = (float(str(value)) for value in cameras[0].numpy())
+    write_camera(directory, Camera(fx, fy, cx, cy, width, height))
     is_missing = batch["confidences"] == 0
     hashes = {body.gender: body.hash for body in datamodule.bodies}
     for number, name in enumerate(names):
