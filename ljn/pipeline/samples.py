@@ -3,7 +3,7 @@
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -147,5 +147,5 @@ def read_truth(path: str | Path) -> Truth:
     shapes = {name: value.shape for name, value in arrays.items()}
     if shapes != _SHAPES:
         raise ValueError(f"truth: expected the arrays {_SHAPES} in '{path}', got {shapes}")
-    known: dict[str, Any] = {**arrays, **{name: str(arrays[name]) for name in ("gender", "body")}}
-    return Truth(**known)
+    gender, body = (str(arrays[name]) for name in ("gender", "body"))
+    return Truth(arrays["joints"], arrays["pose"], arrays["betas"], gender, body)
