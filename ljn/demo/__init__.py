@@ -3,7 +3,7 @@ r"""Depth frames that ship, with their truth: what `task=demo` predicts. A folde
 They are samples of the test set, made by
 
     python run.py task=export task.directory=ljn/demo/kinect_v2 data.num_test=96 \
-        task.indices=[40,11,73] task.names=[walking,sitting,dancing]
+        task.indices=[47,16,73] task.names=[walking,sitting,dancing]
     python run.py task=export task.directory=ljn/demo/realsense_d435 data.num_test=96 data.eval_seed=1 \
         task.indices=[70,78,89] task.names=[running,pointing,stretching] data.camera.fx=385 data.camera.fy=385 \
         data.camera.cx=319.5 data.camera.cy=239.5 data.camera.width=640 data.camera.height=480
