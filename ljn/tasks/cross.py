@@ -45,7 +45,9 @@ def cross(cfg: DictConfig) -> dict[str, float]:
     if task.detector is not None:
         detector = trained(composed(task.detector), task.detector)
         overrides.append(f"data.detector_ckpt={quoted(detector)}")
-    return evaluate_checkpoint(cfg, trained(cfg.copy(), task.trains), overrides, cfg.name, reuses=True)
+    alone = cfg.copy()
+    alone.task.detector = None  # it is for the test
+    return evaluate_checkpoint(cfg, trained(alone, task.trains), overrides, cfg.name, reuses=True)
 
 
 def _check_trains(cfg: DictConfig) -> None:

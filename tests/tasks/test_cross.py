@@ -47,7 +47,9 @@ def test_a_row_is_configured_as_the_experiment_that_it_trains(smoke_config, monk
     assert not (tmp_path / "runs").exists()
 
 
-def test_the_detector_of_a_chain_has_the_calls_sizes_and_machine_and_nothing_of_the_other_stage(monkeypatch):
+def test_the_detector_of_a_chain_has_the_calls_sizes_and_machine_and_nothing_of_the_other_stage(
+    compose_config, monkeypatch
+):
     typed = (
         "experiment=mesh/chain", "name=x", "seed=3", "debug=overfit", "body.genders=[male]", "tags=[a]",
         "data.observation.num_points=64", "data.num_workers=0", "trainer.precision=64", "paths.output_dir='a=b'",
@@ -79,6 +81,26 @@ def test_a_mistake_in_the_changes_is_an_error_before_the_training(smoke_config, 
     with pytest.raises(ValueError, match=message):
         cross(cfg)
     assert not (tmp_path / "runs").exists()
+
+
+def test_the_detector_of_a_chain_is_for_its_test_alone(smoke_config, monkeypatch, tmp_path):
+    shared = ["preset=smoke", "logger=csv", "callbacks.pictures=null", f"paths.output_dir={tmp_path}"]
+    shared += ["data.num_workers=0", "preset.num_train=8", "preset.num_test=8", "preset.num_val=8"]
+    cfg = smoke_config(tmp_path, "experiment=mesh/cascade_chain", *shared)
+    for module in ("train", "cross"):
+        monkeypatch.setattr(
+            f"ljn.tasks.{module}.typed_overrides", lambda: ["experiment=mesh/cascade_chain", *shared]
+        )
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        cross(cfg)
+    [trained] = (tmp_path / "runs").glob("mesh-kinematic-*")
+    [tested] = (tmp_path / "evaluations").iterdir()
+    detectors = [
+        json.loads((directory / "record.json").read_text())["data"]["detector"]
+        for directory in (trained, tested)
+    ]
+    assert detectors[0] is None
+    assert detectors[1]["path"].startswith(str(tmp_path / "runs" / "detector-cascade-"))
 
 
 def test_a_training_begins_with_another_s_weights_and_takes_a_detector_s_joints(
