@@ -47,11 +47,10 @@ class SampleErrors(Callback):
         self.path.parent.mkdir(parents=True, exist_ok=True)
         values = {name: value.numpy() for name, value in arrays.items()}
         np.savez_compressed(self.path, **values)  # type: ignore[arg-type]
-        data: DataModule = trainer.datamodule  # type: ignore[attr-defined]
-        lines = group_lines(
-            values, data.groups("test"), list(pl_module.metrics.table), pl_module.metrics.headline[0]
-        )
-        if lines:
+        data: Any = trainer.datamodule  # type: ignore[attr-defined]
+        groups = data.groups("test") if isinstance(data, DataModule) else {}
+        metrics = pl_module.metrics
+        if lines := group_lines(values, groups, list(metrics.table), metrics.headline[0]):
             with self.path.with_name(layout.GROUPS).open("w", newline="") as file:
                 csv.writer(file).writerows(lines)
 

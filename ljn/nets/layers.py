@@ -193,7 +193,8 @@ def perceive_and_pool(
     """
     layers: list[Any] = list(mlp)
     *inner, last = layers
-    is_dense = not inner or not torch.is_grad_enabled() or 2 * last.out_features > points.shape[1]
+    is_trained = torch.is_grad_enabled() and (points.requires_grad or last.weight.requires_grad)
+    is_dense = not inner or not is_trained or 2 * last.out_features > points.shape[1]
     if is_dense or bool((activation.weight < 0).any()):
         return activate_and_pool(apply_shared(mlp, points, shared), activation, 1)
     with torch.no_grad():

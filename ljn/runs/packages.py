@@ -179,7 +179,9 @@ def _state(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
                 raise ValueError(f"a scale of nothing, {brief(name)}")
             continue
         scale = stored.get(f"{name}{_SCALE}")
-        if scale is not None and (value.dtype != torch.int8 or scale.shape != (*value.shape[:-1], 1)):
+        if (scale is None) == (value.dtype == torch.int8):
+            raise ValueError(f"{brief(name)}: int8 without a scale, or a scale of something else")
+        if scale is not None and scale.shape != (*value.shape[:-1], 1):
             raise ValueError(f"{brief(name)} and its scale do not fit")
         if scale is not None:
             value = value.float() * scale.float()

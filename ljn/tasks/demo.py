@@ -17,6 +17,7 @@ from ljn.pipeline.pictures import draw_prediction
 from ljn.pipeline.pipeline import Pipeline, Prediction
 from ljn.pipeline.samples import SampleFiles, Truth, find_samples, read_truth
 from ljn.pipeline.writing import write_arrays, write_mesh
+from ljn.runs import layout
 from ljn.runs.files import write_text_atomically
 from ljn.tasks.validation import check_writable
 
@@ -49,7 +50,7 @@ def demo(cfg: DictConfig) -> dict[str, float]:
     """Predict frames whose truth is known, without keypoints and with them, into `output_dir/demo`.
 
     Of each frame a picture, arrays (`.npz`) and the mesh (`.glb`), all without keypoints; `overview.png` shows all
-    frames, `turntable.gif` the first frame's mesh with its cloud, and `table.md` the errors.
+    frames, `turntable.gif` the first frame's mesh with its cloud, and a table the errors.
 
     Args:
         cfg: The composed configuration; of it `task`, `ckpt_path`, `body.path`, `paths` and `num_threads` count.
@@ -89,7 +90,7 @@ def demo(cfg: DictConfig) -> dict[str, float]:
         write_turntable(shown[0].prediction, directory / "turntable.gif")
         progress.update()
     table = _table(shown)
-    write_text_atomically(directory / "table.md", table)
+    write_text_atomically(directory / layout.TABLE_MARKDOWN, table)
     print(
         f"{table}\nin {directory}: overview.png, turntable.gif; a picture, the mesh (.glb) and arrays of each frame"
     )
