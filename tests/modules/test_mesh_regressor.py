@@ -21,7 +21,7 @@ def test_eight_samples_are_overfitted(experiment, compose_config, tmp_path):
     batch, _ = build(cfg.data).examples("train", range(8))
     steps = 800
     optimizer = torch.optim.Adam(module.net.parameters(), betas=(0.9, 0.99))
-    schedule = OneCycleLR(optimizer, 4e-3, steps)
+    schedule = OneCycleLR(optimizer, 2e-3, steps)
     for _ in range(steps):
         optimizer.zero_grad()
         module.loss(batch).backward()
