@@ -19,6 +19,7 @@ from ljn.pipeline.samples import SampleFiles, Truth, find_samples, read_truth
 from ljn.pipeline.writing import write_arrays, write_mesh
 from ljn.runs import layout
 from ljn.runs.files import write_text_atomically
+from ljn.tasks.package import chosen_package
 from ljn.tasks.validation import check_writable
 
 _COMMAND_OF_PREDICT = "python run.py task=predict input=DEPTH.png camera=CAMERA.yaml mask=MASK.png"
@@ -53,7 +54,7 @@ def demo(cfg: DictConfig) -> dict[str, float]:
     frames, `turntable.gif` the first frame's mesh with its cloud, and a table the errors.
 
     Args:
-        cfg: The composed configuration; of it `task`, `ckpt_path`, `body.path`, `paths` and `num_threads` count.
+        cfg: The composed configuration; of it `task`, `ckpt_path`, `weights`, `body.path`, `paths` and `num_threads`.
 
     Returns:
         No metrics: they are in the table, which is printed.
@@ -103,7 +104,10 @@ def demo(cfg: DictConfig) -> dict[str, float]:
 
 
 def _pipeline(cfg: DictConfig) -> Pipeline:
-    """The pipeline of the checkpoints that are given, or of the weights that ship."""
+    """The pipeline of the checkpoints or the package that are given, or of the weights that ship."""
+    package = chosen_package(cfg, "ckpt_path", "task.mesh_ckpt_path")
+    if package is not None:
+        return Pipeline.from_pretrained(package)
     given = {"ckpt_path": cfg.ckpt_path, "task.mesh_ckpt_path": cfg.task.mesh_ckpt_path}
     if not any(given.values()):
         return Pipeline.from_pretrained()

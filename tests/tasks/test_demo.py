@@ -83,3 +83,8 @@ def test_make_demo_shows_the_weights_that_ship_and_make_train_demo_trains():
     makefile = (ROOT / "Makefile").read_text()
     assert re.search(r"^demo: install\n\t.*run\.py task=demo$", makefile, re.MULTILINE)
     assert re.search(r"^train-demo: install\n\t.*run\.py sweep=demo$", makefile, re.MULTILINE)
+
+
+def test_the_weights_of_a_demonstration_may_be_named(smoke_config, tmp_path):
+    with pytest.raises(FileNotFoundError, match="nowhere"):
+        demo(smoke_config(tmp_path, "task=demo", "weights=nowhere.safetensors"))
