@@ -20,6 +20,8 @@ from ljn.metrics import MeshMetrics
 from ljn.modules.base import StageModule
 from ljn.nets.body_network import BodyNetwork
 
+_SEED = 0  # of the choice of the loss's vertices
+
 
 class MeshRegressor(StageModule):
     """A mesh regressor with its loss on meshes (Eq. 3.7), optimizer and metrics.
@@ -35,7 +37,7 @@ class MeshRegressor(StageModule):
         genders: Genders of the records.
         predicted: Gender of the body that predictions are meshes of.
         loss: One of `ljn.losses.LOSSES`.
-        loss_vertices: Vertices that the loss is taken over, spread evenly over the body's; None for all.
+        loss_vertices: Vertices that the loss is taken over, drawn once from the body's, always the same; None for all.
         joint_weight: Weight of the same loss of the mesh's joints, beside the vertices'.
     """
 
@@ -72,7 +74,9 @@ class MeshRegressor(StageModule):
                 raise ValueError(
                     f"loss_vertices: expected 1 to {self.body.num_vertices}, got {loss_vertices}; null takes all"
                 )
-            chosen = torch.linspace(0, self.body.num_vertices - 1, loss_vertices).long()
+            # Drawn, not every n-th: a mesh may number its vertices limb by limb, left and right in turn.
+            order = torch.randperm(self.body.num_vertices, generator=torch.Generator().manual_seed(_SEED))
+            chosen = order[:loss_vertices].sort().values
             self.loss_bodies = nn.ModuleList(
                 body.on_vertices(chosen) for body in (self.body, self.target_body)
             )

@@ -2,6 +2,7 @@ import pytest
 import torch
 from torch.optim.lr_scheduler import OneCycleLR
 
+from ljn.body.skeleton import NUM_JOINTS
 from ljn.building import build
 
 EXPERIMENTS = ("proposed", "single", "pointnet", "basic")
@@ -31,3 +32,12 @@ def test_eight_samples_are_overfitted(experiment, compose_config, tmp_path):
     with torch.no_grad():
         apve_mm = module.evaluate(batch, module.test_metrics)["apve"]
     assert float(apve_mm.mean()) < 10
+
+
+def test_loss_vertices_are_of_every_limb_as_many_as_it_has(compose_config):
+    module = build(compose_config("experiment=mesh/kinematic", "preset=small").module)
+    chosen = module.loss_bodies[0]._weights[0].argmax(0)
+    every = module.body._weights[0].argmax(0)
+    expected = torch.bincount(every, minlength=NUM_JOINTS) * len(chosen) / len(every)
+    count = torch.bincount(chosen, minlength=NUM_JOINTS)
+    assert ((count - expected).abs() < 4 * expected.sqrt() + 1).all()
