@@ -223,8 +223,14 @@ class SyntheticDepthDataModule(DataModule):
         """Let the detector, where there is one, move the initial joints; on the device of the batch."""
         if self._detector_checkpoint is None:
             return batch
-        detector = self._detector_checkpoint[0].to(batch["initial_joints"].device)
-        return Batch(**{**batch, "initial_joints": detector(batch)})
+        lifted = batch["initial_joints"]
+        detector = self._detector_checkpoint[0].to(lifted.device)
+        return Batch(**{**batch, "initial_joints": detector(batch), "lifted_joints": lifted})
+
+    @property
+    def detector(self) -> JointDetector | None:
+        """See `DataModule`."""
+        return self._detector_checkpoint[0] if self._detector_checkpoint else None
 
     def setup(self, stage: str) -> None:
         """Build the sets that a stage (`fit`, `validate` or `test`) needs."""

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, TypedDict
 
 import numpy as np
+import torch
 from lightning.pytorch import LightningDataModule
 from torch import Tensor
 
@@ -26,6 +27,7 @@ class Batch(TypedDict, total=False):
         keypoints: `(B, 24, 2)`, with noise.
         confidences: `(B, 24)`, 0 where a keypoint is missing.
         initial_joints: `(B, 24, 3)`: keypoints lifted with the depth image, or what stands in their place.
+        lifted_joints: `(B, 24, 3)`: where a detector has moved the initial joints, those that it was given.
         true_keypoints: `(B, 24, 2)`, true joints projected, pixels.
         joints: `(B, 24, 3)`, true joints, metres, camera frame.
         pose: `(B, 72)`, axis-angle in the body world, heading included, radians.
@@ -41,6 +43,7 @@ class Batch(TypedDict, total=False):
     keypoints: Tensor
     confidences: Tensor
     initial_joints: Tensor
+    lifted_joints: Tensor
     true_keypoints: Tensor
     joints: Tensor
     pose: Tensor
@@ -88,6 +91,11 @@ class DataModule(LightningDataModule):
         Raises:
             ValueError: The split has no such sample.
         """
+
+    @property
+    def detector(self) -> torch.nn.Module | None:
+        """The joint detector whose joints stand in place of the initial ones; None without one."""
+        return None
 
     def groups(self, split: str) -> dict[str, np.ndarray]:
         """Kinds of samples, in whose errors one may be interested: for each way to divide a split, `(S,)` str, the name

@@ -1,6 +1,6 @@
 """What a network takes of a depth image: the one place where it is made, for training and for prediction alike."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TypedDict, cast
 
@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ljn.body.skeleton import NUM_JOINTS
+from ljn.body.skeleton import MIRROR, NUM_JOINTS
 from ljn.cloud.lifting import lift_keypoints
 from ljn.cloud.normals import NORMALS, get_normal_estimator
 from ljn.cloud.sampling import sample_cloud
@@ -128,6 +128,32 @@ def stack_observations(observations: Sequence[Observation]) -> dict[str, Tensor]
     """Observations of the same parts as a batch of tensors, each with a leading dimension B."""
     made = [cast(dict[str, np.ndarray], observation) for observation in observations]
     return {name: torch.from_numpy(np.stack([each[name] for each in made])) for name in made[0]}
+
+
+MIRRORED = frozenset(PARTS) - {"keypoints"}
+"""The parts that can be mirrored; keypoints would need the image's size."""
+
+
+def mirror_observations(seen: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """A batch of observations as a mirror shows them, left and right exchanged; its parts that are in `MIRRORED`.
+
+    The mirror is the plane x = 0 of the camera frame. Twice mirrored, joints are back where they were.
+    """
+    made = {name: value for name, value in seen.items() if name in MIRRORED}
+    across = {
+        name: made[name].new_tensor([-1.0, 1, 1]) for name in ("points", "initial_joints") if name in made
+    }
+    if "points" in made:
+        made["points"] = made["points"] * across["points"].repeat(2)
+    if "initial_joints" in made:
+        made["initial_joints"] = made["initial_joints"][:, list(MIRROR)] * across["initial_joints"]
+    if "confidences" in made:
+        made["confidences"] = made["confidences"][:, list(MIRROR)]
+    if "crop" in made:
+        made["crop"] = made["crop"].flip(-1)
+        fx, fy, cx, cy = made["crop_camera"].unbind(-1)
+        made["crop_camera"] = torch.stack([fx, fy, made["crop"].shape[-1] - 1 - cx, cy], -1)
+    return made
 
 
 def crop_body(depth: np.ndarray, camera: Camera, size_px: int) -> tuple[np.ndarray, np.ndarray]:

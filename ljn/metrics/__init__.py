@@ -5,6 +5,7 @@ from ljn.metrics.functional import (
     apve_procrustes,
     apve_root_aligned,
     exchanged,
+    harmed,
     joint_errors_mm,
     keypoint_distances_px,
     mpjpe,
@@ -16,13 +17,14 @@ from ljn.metrics.functional import (
     pckh_threshold_mm,
 )
 from ljn.metrics.joints import JointMetrics
-from ljn.metrics.meshes import MeshMetrics
+from ljn.metrics.meshes import MeshMetrics, RefinedMeshMetrics
 from ljn.metrics.samples import Quantity, SampleMax, SampleMean, SampleMetric, StageMetrics
 
 __all__ = [
     "JointMetrics",
     "MeshMetrics",
     "Quantity",
+    "RefinedMeshMetrics",
     "SampleMax",
     "SampleMean",
     "SampleMetric",
@@ -31,6 +33,7 @@ __all__ = [
     "apve_procrustes",
     "apve_root_aligned",
     "exchanged",
+    "harmed",
     "joint_errors_mm",
     "keypoint_distances_px",
     "mpjpe",

@@ -177,6 +177,22 @@ def apve_procrustes(pred: Tensor, target: Tensor) -> Tensor:
     return apve(procrustes_align(pred.double(), target), target)
 
 
+def harmed(raw: Tensor, refined: Tensor, target: Tensor, limit_mm: float = 5.0) -> Tensor:
+    """Return whether the refined mesh is worse than the raw one, by more than a limit of the mean vertex error.
+
+    Args:
+        raw: `(B, V, 3)`, metres, in the target's frame.
+        refined: `(B, V, 3)`.
+        target: `(B, V, 3)`.
+        limit_mm: Millimetres.
+
+    Returns:
+        `(B,)` float64: 100 where it is, 0 elsewhere; the mean over samples is a percentage.
+    """
+    worse = apve(refined, target).mean(-1) > apve(raw, target).mean(-1) + limit_mm
+    return 100 * worse.double()
+
+
 def keypoint_distances_px(noisy: Tensor, clean: Tensor) -> Tensor:
     """Return how far the noise has moved each 2D keypoint.
 

@@ -46,6 +46,7 @@ class MeshMetrics(StageMetrics):
         floor_vertices: Tensor,
         initial_joints: Tensor,
         joints: Tensor,
+        **more: Tensor,
     ) -> dict[str, Tensor]:
         """Add a batch, metres; see `StageMetrics.update`.
 
@@ -57,8 +58,9 @@ class MeshMetrics(StageMetrics):
             floor_vertices: `(B, V, 3)`, body frame: the nearest that the predicted body comes to the truth.
             initial_joints: `(B, 24, 3)`, camera frame.
             joints: `(B, 24, 3)`, camera frame, the truth.
+            more: What other quantities of the table take, as it comes.
         """
-        tensors = {
+        tensors = more | {
             "pred_vertices": pred_vertices,
             "vertices": vertices,
             "pred_body_joints": pred_body_joints,
@@ -77,3 +79,50 @@ class MeshMetrics(StageMetrics):
                 placed = (tensors[name], tensors[root], camera_root)
                 tensors[f"{name}_camera"] = place_at_root(*(value.double() for value in placed))
         return super().update(**tensors)
+
+
+_REFINED = ("refined_vertices", "vertices")
+
+
+class RefinedMeshMetrics(MeshMetrics):
+    """The same, and under `refined_*` those of meshes that were fitted to the depth, placed where they fit."""
+
+    table: ClassVar = {
+        **MeshMetrics.table,
+        "refined_apve": Quantity(functional.apve, _REFINED),
+        "refined_mpjpe": Quantity(functional.mpjpe, ("refined_body_joints", "body_joints")),
+        "refined_apve_root_aligned": Quantity(
+            functional.apve_root_aligned, (*_REFINED, "refined_root", "root")
+        ),
+        "refined_apve_procrustes": Quantity(functional.apve_procrustes, _REFINED),
+        "refined_apve_camera": Quantity(functional.apve, ("refined_vertices_camera", "vertices_camera")),
+        "refined_mpjpe_camera": Quantity(
+            functional.mpjpe, ("refined_body_joints_camera", "body_joints_camera")
+        ),
+        "refined_harmed": Quantity(
+            functional.harmed, ("pred_vertices_camera", "refined_vertices_camera", "vertices_camera"), "%"
+        ),
+    }
+
+    def update(  # type: ignore[override]
+        self,
+        refined_vertices: Tensor,
+        refined_body_joints: Tensor,
+        refined_camera_root: Tensor,
+        **tensors: Tensor,
+    ) -> dict[str, Tensor]:
+        """Add a batch, metres; see `MeshMetrics.update`.
+
+        Args:
+            refined_vertices: `(B, V, 3)`, body frame.
+            refined_body_joints: `(B, 24, 3)`, body frame.
+            refined_camera_root: `(B, 3)`, the refined body's root, camera frame.
+            tensors: What `MeshMetrics.update` takes.
+        """
+        root = refined_body_joints[:, ROOT]
+        refined = {"refined_vertices": refined_vertices, "refined_body_joints": refined_body_joints}
+        placed = {
+            f"{name}_camera": place_at_root(value.double(), root.double(), refined_camera_root.double())
+            for name, value in refined.items()
+        }
+        return super().update(**tensors, **refined, **placed, refined_root=root)

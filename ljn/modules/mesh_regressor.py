@@ -1,7 +1,7 @@
 """Stage 2 as a LightningModule: training, validation and test of a mesh regressor."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
 
@@ -12,13 +12,16 @@ from torch.optim.lr_scheduler import LRScheduler
 
 from ljn.body import SMPL, load_body_models
 from ljn.body.skeleton import ROOT
+from ljn.cloud.observation import PARTS
 from ljn.data import Batch
 from ljn.geometry.camera import place_at_root
 from ljn.geometry.rotations import rotmat_to_rotvec
 from ljn.losses import check_loss, mesh_loss
-from ljn.metrics import MeshMetrics
+from ljn.metrics import MeshMetrics, RefinedMeshMetrics
 from ljn.modules.base import StageModule
 from ljn.nets.body_network import BodyNetwork
+from ljn.refinement import Refiner, refine
+from ljn.refinement.looks import Detect
 
 _SEED = 0  # of the choice of the loss's vertices
 
@@ -68,6 +71,8 @@ class MeshRegressor(StageModule):
         self.body = SMPL(load_body_models(body_path, [predicted]))
         self.target_body = SMPL(load_body_models(body_path, list(genders)))
         net.use_body(self.body)
+        self.refiner: Refiner | None = None
+        self.detect: Detect | None = None
         self.loss_bodies = nn.ModuleList([self.body, self.target_body])
         if loss_vertices is not None:
             if not 1 <= loss_vertices <= self.body.num_vertices:
@@ -80,6 +85,25 @@ class MeshRegressor(StageModule):
             self.loss_bodies = nn.ModuleList(
                 body.on_vertices(chosen) for body in (self.body, self.target_body)
             )
+
+    def refine_with(self, refiner: Refiner, detect: Detect | None = None) -> None:
+        """Fit the meshes of every evaluation to the depth, too: metrics `refined_*` beside the others.
+
+        A batch then has to hold what the refiner takes.
+
+        Args:
+            refiner: What fits, of the predicted body.
+            detect: The detector whose joints the batches hold, for a second look; see `ljn.refinement.looks`.
+        """
+        self.refiner, self.detect = refiner, detect
+        self.metrics = RefinedMeshMetrics  # type: ignore[misc]
+        self.val_metrics = RefinedMeshMetrics(prefix="val/")
+        self.test_metrics = RefinedMeshMetrics(prefix="test/")
+
+    @property
+    def observes(self) -> tuple[str, ...]:
+        """What of an observation an evaluation takes: the network and, where there is one, the refiner."""
+        return tuple(dict.fromkeys((*self.takes, *(self.refiner.takes if self.refiner else ()))))
 
     @property
     def body_hashes(self) -> tuple[str, ...]:
@@ -112,6 +136,7 @@ class MeshRegressor(StageModule):
         rotmats, betas = (values[-1] for values in self(batch))
         pred_vertices, pred_joints = self.body.from_rotmats(rotmats, betas)
         vertices, joints = self.target(batch)
+        refined = self._refined(batch, rotmats, betas) if self.refiner else {}
         samples = metrics.update(
             pred_vertices=pred_vertices,
             vertices=vertices,
@@ -120,6 +145,7 @@ class MeshRegressor(StageModule):
             floor_vertices=self._floor(batch),
             initial_joints=batch["initial_joints"],
             joints=batch["joints"],
+            **refined,
         )
         pred_root, initial_root = pred_joints[:, ROOT], batch["initial_joints"][:, ROOT]
         return {
@@ -129,6 +155,27 @@ class MeshRegressor(StageModule):
             "pred_pose": rotmat_to_rotvec(rotmats).flatten(-2),
             "pred_betas": betas,
             **samples,
+        }
+
+    def _refined(self, batch: Batch, rotmats: Tensor, betas: Tensor) -> dict[str, Tensor]:
+        """What `RefinedMeshMetrics` takes of the refined meshes."""
+        assert self.refiner is not None
+        joints = batch["initial_joints"]
+        tensors = cast(Mapping[str, Tensor], batch)
+        seen = {name: tensors[name] for name in PARTS if name in tensors}
+        if "lifted_joints" in batch:
+            seen["initial_joints"] = batch["lifted_joints"]
+
+        def regress(observations: Mapping[str, Tensor]) -> tuple[Tensor, Tensor]:
+            values = self(observations)
+            return values[0][-1], values[1][-1]
+
+        refined, _ = refine(self.refiner, seen, joints, (rotmats, betas), self.detect, regress)
+        vertices, body_joints = self.body.from_rotmats(refined.rotmats, refined.betas)
+        return {
+            "refined_vertices": vertices,
+            "refined_body_joints": body_joints,
+            "refined_camera_root": refined.root,
         }
 
     def _floor(self, batch: Batch) -> Tensor:

@@ -1,6 +1,6 @@
 """The trained stages as one function: depth, camera and 2D keypoints in, joints and mesh out."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, NamedTuple, Self
@@ -9,13 +9,14 @@ import numpy as np
 import torch
 
 from ljn.body.skeleton import ROOT
-from ljn.cloud.observation import Observation, ObservationRecipe, observe, stack_observations
+from ljn.cloud.observation import MIRRORED, Observation, ObservationRecipe, observe, stack_observations
 from ljn.geometry.camera import Camera, place_at_root
 from ljn.geometry.rotations import rotmat_to_rotvec
 from ljn.modules.joint_detector import JointDetector
 from ljn.modules.mesh_regressor import MeshRegressor
 from ljn.pipeline.depth import body_depth
 from ljn.pipeline.keypoints import MIN_KNOWN, check_place, smpl_keypoints
+from ljn.refinement import Refiner, chosen_settings, refine
 from ljn.runs.checkpoints import Checkpoint, load_module
 from ljn.runs.packages import DEFAULT, find_package, stages_of
 
@@ -36,9 +37,13 @@ class Prediction:
         pose: `(72,)` axis-angle, radians; the first three turn SMPL's rest frame into body world, as in `Batch`.
         betas: `(10,)`.
         faces: `(F, 3)` int64, vertex indices; of a batch, too.
+        mesh_joints: `(24, 3)`, the mesh's own joints.
+        is_refined: Whether mesh, pose and shape are fitted to the depth; false where the fit was given up.
+        residual_mm: `(2,)`, median distance of the cloud's points to the mesh, as guessed and as returned.
 
     Without keypoints, `initial_joints`, `keypoints` and `confidences` are None; without a mesh regressor, `vertices`,
-    `pose`, `betas` and `faces`.
+    `pose`, `betas`, `faces` and `mesh_joints`; without refinement, `is_refined` and `residual_mm`. With it, the mesh is
+    placed where it fits, and `joints` are those that the fit began with.
     """
 
     joints: np.ndarray
@@ -50,6 +55,9 @@ class Prediction:
     pose: np.ndarray | None = None
     betas: np.ndarray | None = None
     faces: np.ndarray | None = None
+    mesh_joints: np.ndarray | None = None
+    is_refined: np.ndarray | None = None
+    residual_mm: np.ndarray | None = None
 
     def __getitem__(self, index: int) -> Self:
         """One of a batch."""
@@ -103,11 +111,24 @@ class Pipeline:
     Args:
         detector: The joint detector.
         regressor: The mesh regressor; None predicts joints alone.
+        refine: Whether meshes are fitted to the depth, and how: see `ljn.refinement`. True is "accurate".
+
+    Raises:
+        ValueError: There is no such setting, or no mesh to refine.
     """
 
-    def __init__(self, detector: Stage, regressor: Stage | None = None) -> None:
+    def __init__(
+        self, detector: Stage, regressor: Stage | None = None, refine: bool | str | None = None
+    ) -> None:
         self.detector = detector
         self.regressor = regressor
+        self.refiner: Refiner | None = None
+        if (settings := chosen_settings(refine)) is not None:
+            if regressor is None:
+                raise ValueError(
+                    f"refine: {refine!r} fits meshes, and there is no mesh regressor; give one's weights"
+                )
+            self.refiner = Refiner(regressor.module.body, settings)
 
     @classmethod
     def load(
@@ -116,6 +137,7 @@ class Pipeline:
         mesh_ckpt: str | Path | None = None,
         device: str | torch.device = "cpu",
         body_path: str | Path | None = None,
+        refine: bool | str | None = None,
     ) -> Self:
         """The pipeline of two checkpoints.
 
@@ -125,6 +147,7 @@ class Pipeline:
             device: Where the networks run.
             body_path: File or folder of the body whose mesh is predicted, for weights trained on bodies that are not
                 embedded; None: where it was in the training.
+            refine: See the class.
 
         Raises:
             FileNotFoundError: There is no such file.
@@ -133,7 +156,7 @@ class Pipeline:
         module, checkpoint = load_module(detector_ckpt, JointDetector, "detector_ckpt")
         detector = _stage(module.to(device), checkpoint)
         if mesh_ckpt is None:
-            return cls(detector)
+            return cls(detector, refine=refine)
         module, mesh_checkpoint = load_module(mesh_ckpt, MeshRegressor, "mesh_ckpt", body_path)
         if unknown := mesh_checkpoint.unknown_bodies(checkpoint.body_hash.split("-")):
             raise ValueError(
@@ -147,7 +170,7 @@ class Pipeline:
                 f"here is {unknown[0]}; give the training's body file (body.path=FILE, in Python body_path=FILE), or "
                 "use the version of this library whose embedded body it was"
             )
-        return cls(detector, _stage(module.to(device), mesh_checkpoint))
+        return cls(detector, _stage(module.to(device), mesh_checkpoint), refine)
 
     @classmethod
     def from_pretrained(
@@ -155,6 +178,7 @@ class Pipeline:
         name: str | Path = DEFAULT,
         device: str | torch.device = "cpu",
         body_path: str | Path | None = None,
+        refine: bool | str | None = None,
     ) -> Self:
         """The pipeline of trained weights that ship in one file, a package.
 
@@ -163,6 +187,7 @@ class Pipeline:
                 `find_package`.
             device: See `load`.
             body_path: See `load`.
+            refine: See the class.
 
         Raises:
             FileNotFoundError: There is no such file.
@@ -170,7 +195,8 @@ class Pipeline:
             ImportError: They are on the hub, and `huggingface_hub` is missing.
         """
         path = find_package(name, "name")
-        return cls.load(path, path if "mesh" in stages_of(path, "name") else None, device, body_path)
+        mesh = path if "mesh" in stages_of(path, "name") else None
+        return cls.load(path, mesh, device, body_path, refine)
 
     @property
     def needs_keypoints(self) -> bool:
@@ -231,6 +257,8 @@ class Pipeline:
             return observe(metres, camera, positions, stage.recipe, takes, rng, confidences)
 
         takes = {*self.detector.module.takes, "points", *(() if named is None else ("initial_joints",))}
+        if self.refiner is not None:
+            takes |= set(self.refiner.takes)
         regressor = None
         if self.regressor is not None:
             # Its initial joints are the detector's.
@@ -253,21 +281,48 @@ class Pipeline:
             arrays |= {name: seen[name] for name in ("initial_joints", "keypoints")}
             arrays["confidences"] = torch.from_numpy(np.stack(confidences))
         if self.regressor is not None:
-            regressor = self.regressor.module
-            seen = stack_observations([frame.regressor for frame in frames if frame.regressor is not None])
-            rotmats, betas = (
-                values[-1] for values in regressor(_on(regressor.device, seen) | {"initial_joints": joints})
-            )
-            body = regressor.body.from_rotmats(rotmats, betas)
-            arrays |= {
-                "vertices": place_at_root(body.vertices, body.joints[:, ROOT], joints[:, ROOT]),
-                "pose": rotmat_to_rotvec(rotmats).flatten(-2),
-                "betas": betas,
-                "faces": regressor.body.faces,
-            }
+            made, joints = self._meshes(self.regressor.module, frames, seen, joints)
+            arrays |= made
         return Prediction(
             joints.cpu().numpy(), **{name: value.cpu().numpy() for name, value in arrays.items()}
         )
+
+    def _meshes(
+        self,
+        regressor: Any,
+        frames: Sequence[ObservedFrame],
+        detected: dict[str, torch.Tensor],
+        joints: torch.Tensor,
+    ) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
+        """A prediction's arrays of its meshes, and the joints that they began with."""
+        seen = stack_observations([frame.regressor for frame in frames if frame.regressor is not None])
+
+        def regress(observations: Mapping[str, torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
+            rotmats, betas = (values[-1] for values in regressor(observations))
+            return rotmats, betas
+
+        rotmats, betas = regress(_on(regressor.device, seen) | {"initial_joints": joints})
+        root = joints[:, ROOT]
+        made = {}
+        if self.refiner is not None:
+            detector = self.detector.module
+            # A second look at points alone would be at those of the detector's recipe.
+            looks_twice = set(detector.takes) <= MIRRORED and set(regressor.takes) <= {"initial_joints"}
+            refined, joints = refine(
+                *(self.refiner, _on(detector.device, detected), joints, (rotmats, betas)),
+                *(detector if looks_twice else None, regress),
+            )
+            rotmats, betas, root = refined.rotmats, refined.betas, refined.root
+            made = {"is_refined": refined.is_kept, "residual_mm": refined.residual_mm}
+        body = regressor.body.from_rotmats(rotmats, betas)
+        made |= {
+            "vertices": place_at_root(body.vertices, body.joints[:, ROOT], root),
+            "mesh_joints": place_at_root(body.joints, body.joints[:, ROOT], root),
+            "pose": rotmat_to_rotvec(rotmats).flatten(-2),
+            "betas": betas,
+            "faces": regressor.body.faces,
+        }
+        return made, joints
 
 
 def _on(device: torch.device, tensors: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:

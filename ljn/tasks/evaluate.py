@@ -7,7 +7,12 @@ import torch
 from omegaconf import DictConfig
 
 from ljn.building import build
+from ljn.cloud.observation import MIRRORED
 from ljn.data import DataModule
+from ljn.modules.joint_detector import JointDetector
+from ljn.modules.mesh_regressor import MeshRegressor
+from ljn.refinement import Refiner, chosen_settings
+from ljn.refinement.looks import Detect
 from ljn.runs import layout
 from ljn.runs.checkpoints import Checkpoint, load_state, read_checkpoint
 from ljn.runs.files import read_metrics, write_json
@@ -33,7 +38,8 @@ def evaluate(cfg: DictConfig) -> dict[str, float]:
             body are applied to them.
 
     Returns:
-        The test metrics, also in `metrics.json` of the evaluation's directory.
+        The test metrics, with `refine` those of the refined meshes beside the others, also in `metrics.json` of the
+        evaluation's directory.
 
     Raises:
         FileNotFoundError: There is no such checkpoint.
@@ -64,13 +70,17 @@ def evaluate_checkpoint(
     an equal evaluation, if there is a complete one, is taken instead.
     """
     checkpoint = read_checkpoint(path, stage=stage)
+    chosen_settings(cfg.refine)  # before work starts
     call, cfg = cfg, with_checkpoint_config(cfg, checkpoint, overrides)
     cfg.name = name or cfg.name
     validate(cfg)
 
     datamodule: DataModule = build(cfg.data)
     datamodule.prepare_data()
+    settings = chosen_settings(call.refine)
     evaluated = {**identity(cfg, datamodule.fingerprint), "checkpoint": checkpoint.file_hash}
+    if settings is not None:
+        evaluated["refine"] = settings
     identity_hash = config_hash(evaluated)
     run_dir = set_run_directory(cfg, "evaluations", identity_hash)
     call.paths.run_dir = str(run_dir)
@@ -78,15 +88,29 @@ def evaluate_checkpoint(
         if reuses and not call.rerun and is_complete(run_dir, identity_hash):
             _LOG.info("%s is complete; evaluate it again with rerun=true", run_dir)
             return read_metrics(run_dir) or {}
-        return _evaluate(cfg, datamodule, checkpoint, run_dir, identity_hash)
+        return _evaluate(cfg, datamodule, checkpoint, run_dir, identity_hash, settings)
 
 
 def _evaluate(
-    cfg: DictConfig, datamodule: DataModule, checkpoint: Checkpoint, run_dir: Path, identity_hash: str
+    cfg: DictConfig,
+    datamodule: DataModule,
+    checkpoint: Checkpoint,
+    run_dir: Path,
+    identity_hash: str,
+    settings: str | None,
 ) -> dict[str, float]:
     prepare_process(cfg)
     module = build(cfg.module)
-    datamodule.takes = module.takes
+    if settings is not None:
+        if not isinstance(module, MeshRegressor):
+            raise ValueError(
+                f"refine: {cfg.refine!r} fits meshes, and '{checkpoint.path}' is no mesh regressor; give one's "
+                "checkpoint, or of weights task.stage=mesh"
+            )
+        module.refine_with(Refiner(module.body, settings), _second_look(datamodule))
+        datamodule.takes = module.observes
+    else:
+        datamodule.takes = module.takes
     load_state(module, checkpoint)
     check_bodies(checkpoint, {body.hash for body in datamodule.bodies} | set(module.body_hashes))
     facts = {
@@ -97,6 +121,7 @@ def _evaluate(
         "checkpoint": {"path": str(checkpoint.path), "hash": checkpoint.file_hash, "epoch": checkpoint.epoch},
         "data": datamodule.describe(("test",)),
         **module.describe(),
+        "refine": settings,
         "predicted_body": "-".join(module.body_hashes) or None,
     }
     with RunRecord(run_dir, facts) as record:
@@ -110,3 +135,9 @@ def _evaluate(
             write_json(run_dir / layout.METRICS, metrics)
     _LOG.info("%s on %s: %s", checkpoint.run, cfg.name, run_dir)
     return metrics
+
+
+def _second_look(datamodule: DataModule) -> Detect | None:
+    """The data's detector, where it can see an image in a mirror."""
+    detector = datamodule.detector
+    return detector if isinstance(detector, JointDetector) and set(detector.takes) <= MIRRORED else None

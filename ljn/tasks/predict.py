@@ -19,6 +19,7 @@ from ljn.pipeline.inputs import read_camera
 from ljn.pipeline.pictures import draw_prediction
 from ljn.pipeline.pipeline import Pipeline, Prediction
 from ljn.pipeline.writing import write_arrays, write_mesh
+from ljn.refinement import chosen_settings
 from ljn.runs.files import path_part, write_json
 from ljn.runs.packages import DEFAULT, shipped
 from ljn.tasks.package import chosen_package
@@ -41,9 +42,9 @@ def predict(cfg: DictConfig) -> dict[str, float]:
     each frame's outcome.
 
     Args:
-        cfg: The composed configuration; of it `task`, `ckpt_path`, `weights`, `body.path`, `paths`, `num_threads` and
-            `trainer.accelerator` count. With neither checkpoints nor `weights`, the default weights are taken, if any
-            ship.
+        cfg: The composed configuration; of it `task`, `ckpt_path`, `weights`, `refine`, `body.path`, `paths`,
+            `num_threads` and `trainer.accelerator` count. With neither checkpoints nor `weights`, the default weights
+            are taken, if any ship.
 
     Returns:
         `predict/frames`, and with a mesh regressor `predict/median_distance_mm`: the median over the frames of the
@@ -72,9 +73,9 @@ def predict(cfg: DictConfig) -> dict[str, float]:
     use_gpu = cfg.trainer.accelerator != "cpu" and torch.cuda.is_available()
     device = "cuda" if use_gpu else "cpu"
     if package:
-        pipeline = Pipeline.from_pretrained(package, device, cfg.body.path)
+        pipeline = Pipeline.from_pretrained(package, device, cfg.body.path, cfg.refine)
     else:
-        pipeline = Pipeline.load(cfg.ckpt_path, task.mesh_ckpt_path, device, cfg.body.path)
+        pipeline = Pipeline.load(cfg.ckpt_path, task.mesh_ckpt_path, device, cfg.body.path, cfg.refine)
     if task.keypoints is None and pipeline.needs_keypoints:
         raise ValueError(
             f"task.keypoints: expected a path, since the detector '{package or cfg.ckpt_path}' takes keypoints, got "
@@ -92,6 +93,7 @@ def predict(cfg: DictConfig) -> dict[str, float]:
         "predict/failed": len(failed),
         "detector": pipeline.detector.origin,
         "regressor": pipeline.regressor.origin if pipeline.regressor else None,
+        "refine": chosen_settings(cfg.refine),
         "camera": asdict(camera),
         "frames": results,
     }
@@ -140,5 +142,7 @@ def _write(path: Path, prediction: Prediction, depth: np.ndarray, camera: Camera
         return facts
     for suffix in (".ply", ".glb"):
         write_mesh(path.with_name(f"{path.name}{suffix}"), prediction.vertices, prediction.faces)
+    if prediction.is_refined is not None and prediction.residual_mm is not None:
+        facts |= {"is_refined": bool(prediction.is_refined), "residual_mm": prediction.residual_mm.tolist()}
     distances = distances_to_mesh(prediction.points[:, :3], prediction.vertices, prediction.faces)
     return facts | {"median_distance_mm": 1000 * float(np.median(distances))}

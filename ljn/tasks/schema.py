@@ -17,6 +17,7 @@ class Config:
     num_threads: int | None = None
     ckpt_path: str | None = None
     weights: str | None = None
+    refine: Any = None
     rerun: bool = False
     tables: list[str] = field(default_factory=list)
     optimized_metric: str = "val/mpjpe"
