@@ -189,7 +189,7 @@ def harmed(raw: Tensor, refined: Tensor, target: Tensor, limit_mm: float = 5.0) 
     Returns:
         `(B,)` float64: 100 where it is, 0 elsewhere; the mean over samples is a percentage.
     """
-    worse = apve(refined, target).mean(-1) > apve(raw, target).mean(-1) + limit_mm
+    worse = apve(refined, target) > apve(raw, target) + limit_mm
     return 100 * worse.double()
 
 

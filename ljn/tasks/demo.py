@@ -107,17 +107,17 @@ def _pipeline(cfg: DictConfig) -> Pipeline:
     """The pipeline of the checkpoints or the package that are given, or of the weights that ship."""
     package = chosen_package(cfg, "ckpt_path", "task.mesh_ckpt_path")
     if package is not None:
-        return Pipeline.from_pretrained(package)
+        return Pipeline.from_pretrained(package, refine=cfg.refine)
     given = {"ckpt_path": cfg.ckpt_path, "task.mesh_ckpt_path": cfg.task.mesh_ckpt_path}
     if not any(given.values()):
-        return Pipeline.from_pretrained()
+        return Pipeline.from_pretrained(refine=cfg.refine)
     for key, value in given.items():
         if not isinstance(value, str):
             raise ValueError(
                 f"{key}: expected a path, got {value!r}; give both ckpt_path=DETECTOR.ckpt and "
                 "mesh_ckpt_path=MESH.ckpt, or neither for the weights that ship"
             )
-    pipeline = Pipeline.load(cfg.ckpt_path, cfg.task.mesh_ckpt_path)
+    pipeline = Pipeline.load(cfg.ckpt_path, cfg.task.mesh_ckpt_path, refine=cfg.refine)
     if pipeline.needs_keypoints:
         raise ValueError(
             f"ckpt_path: the detector '{cfg.ckpt_path}' takes keypoints, and the frames are predicted without them; "
@@ -148,7 +148,8 @@ def _show(
 
     def errors_mm(found: Prediction) -> tuple[float, float]:
         assert found.vertices is not None  # the pipeline has a mesh regressor
-        pairs = ((mpjpe, found.joints, truth.joints), (apve, found.vertices, vertices))
+        joints = found.joints if found.is_refined is None else found.mesh_joints
+        pairs = ((mpjpe, joints, truth.joints), (apve, found.vertices, vertices))
         joints_mm, vertices_mm = (
             float(metric(torch.from_numpy(pred), torch.from_numpy(target))) for metric, pred, target in pairs
         )

@@ -12,7 +12,7 @@ import dataclasses
 import json
 import time
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -139,55 +139,61 @@ def run(chain: Chain, samples: Samples, refiner: Refiner, second_look: bool = Tr
     return fits, 1000 * (time.process_time() - start) / len(samples.joints)
 
 
+def heading(title: str, errors: dict[str, Tensor]) -> None:
+    """Print a table's head."""
+    print(f"\n{title}: mean / median / 90th percentile")
+    print("|", " | ".join(["", *errors, "harmed", "ms"]), "|\n|---" + "|---:" * (len(errors) + 2) + "|")
+
+
 def tables(weights: str, num_samples: int) -> None:
-    """Print the tables."""
+    """Print the tables: the settings on all samples, and each change alone on some."""
     chain = Chain(weights)
-    step = max(1, 2000 // num_samples)
     accurate = SETTINGS["accurate"]
     for tag, missing in KEYPOINTS.items():
-        samples = chain.samples("test", missing, step)
-        raw_refiner = Refiner(chain.body)
-        guess = raw_refiner.guess(samples.rotmats, samples.betas, samples.joints)
-        raw = chain.errors(samples, samples.rotmats, samples.betas, guess.root)
-        print(f"\n{tag}, {len(samples.joints)} samples: mean / median / 90th percentile")
-        print("|", " | ".join(["", *raw, "harmed", "ms"]), "|\n|---" + "|---:" * (len(raw) + 2) + "|")
+        samples = chain.samples("test", missing, max(1, 2000 // num_samples))
+        raw = as_guessed(chain, samples)
+        heading(f"{tag}, {len(samples.joints)} samples", raw)
         row("as guessed", raw)
-        whole, rows = samples, {}
-        rows["fast"] = SETTINGS["fast"]
-        rows["accurate"] = accurate
-        rows["accurate, one look"] = accurate
-        for name, settings in rows.items():
-            fits, ms = run(chain, whole, Refiner(chain.body, settings), "one look" not in name)
-            errors = chain.errors(whole, fits.rotmats, fits.betas, fits.root)
-            row(name, errors, raw, ms)
-            if name == "accurate":
-                kept, doubt = 100 * fits.is_kept.double().mean(), fits.unexplained.mean(0).tolist()
-                residual = fits.residual_mm.mean(0).tolist()
-                summary = f"kept {kept:.1f} %; residual {residual[0]:.1f} -> {residual[1]:.1f} mm; "
-                print(f"<!-- {summary}unexplained {100 * doubt[0]:.1f} -> {100 * doubt[1]:.1f} % -->")
-        for num_steps in (1, 2, 4, 8):
-            changed = dataclasses.replace(accurate, num_steps=num_steps)
-            fits, ms = run(chain, samples, Refiner(chain.body, changed), False)
-            row(f"{num_steps} steps", chain.errors(samples, fits.rotmats, fits.betas, fits.root), raw, ms)
-        changes = {
+        for name, looks in (("fast", True), ("accurate", True), ("accurate", False)):
+            fits, ms = run(chain, samples, Refiner(chain.body, name), looks)
+            errors = chain.errors(samples, fits.rotmats, fits.betas, fits.root)
+            row(name if looks else f"{name}, one look", errors, raw, ms)
+            if looks:
+                kept, residual = 100 * fits.is_kept.double().mean(), fits.residual_mm.mean(0).tolist()
+                far = (100 * fits.unexplained.mean(0)).tolist()
+                text = f"kept {kept:.1f} %; residual {residual[0]:.1f} -> {residual[1]:.1f} mm; "
+                print(f"<!-- {name}: {text}farther than 5 cm {far[0]:.1f} -> {far[1]:.1f} % -->")
+
+        samples = chain.samples("test", missing, max(1, 2000 // min(num_samples, 250)))
+        raw = as_guessed(chain, samples)
+        heading(f"{tag}, {len(samples.joints)} samples, one look", raw)
+        row("as guessed", raw)
+        changes: dict[str, dict[str, Any]] = {
+            "accurate": {},
+            **{f"{steps} steps": {"num_steps": steps} for steps in (1, 2, 4, 20)},
+            "256 points": {"num_points": 256},
+            "861 vertices": {"num_vertices": 861},
             "points of the cloud: their planes alone": {"vertex_share": 0.0},
             "no outline": {"outline_share": 0.0},
             "a tenth of the guess's weight": {"prior_weight": 0.1},
             "a hundredth": {"prior_weight": 0.01},
-            "scales of 1 m: hardly robust": {"scales_m": (1.0, 1.0)},
+            "scale of 1 m: hardly robust": {"scales_m": (1.0, 1.0)},
         }
         for name, change in changes.items():
-            changed = dataclasses.replace(accurate, **change)
-            fits, ms = run(chain, samples, Refiner(chain.body, changed), False)
+            fits, ms = run(
+                chain, samples, Refiner(chain.body, dataclasses.replace(accurate, **change)), False
+            )
             row(name, chain.errors(samples, fits.rotmats, fits.betas, fits.root), raw, ms)
         diagonal = np.diag(np.diag(np.load(PATH)["covariance"]))
         fits, ms = run(chain, samples, Refiner(chain.body, accurate, diagonal), False)
-        row(
-            "errors independent of each other",
-            chain.errors(samples, fits.rotmats, fits.betas, fits.root),
-            raw,
-            ms,
-        )
+        errors = chain.errors(samples, fits.rotmats, fits.betas, fits.root)
+        row("the guess's errors independent of each other", errors, raw, ms)
+
+
+def as_guessed(chain: Chain, samples: Samples) -> dict[str, Tensor]:
+    """The guesses' errors, where their joints lie nearest to the detected ones."""
+    root = Refiner(chain.body, "fast").guess(samples.rotmats, samples.betas, samples.joints).root
+    return chain.errors(samples, samples.rotmats, samples.betas, root)
 
 
 def times(weights: str) -> None:

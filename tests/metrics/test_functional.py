@@ -192,3 +192,11 @@ def test_root_aligned_pckh_forgives_a_common_shift_and_nothing_else():
     expected = functional.pckh(pred - pred[:, :1] + target[:, :1], target)
     torch.testing.assert_close(functional.pckh_root_aligned(shifted, target), expected)
     assert expected.min() < 100
+
+
+def test_a_mesh_is_harmed_beyond_the_limit_alone():
+    target = torch.zeros(3, 10, 3)
+    raw, refined = target + 0.01, target + torch.tensor([0.012, 0.013, 0.005])[:, None, None]
+    expected = [0.0, 100.0, 0.0]  # by 3.5, 5.2 and -8.7 mm
+    assert functional.harmed(raw, refined, target).tolist() == expected
+    assert functional.harmed(raw, refined, target, limit_mm=3).tolist() == [100.0, 100.0, 0.0]

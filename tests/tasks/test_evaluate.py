@@ -5,7 +5,8 @@ import torch
 import yaml
 
 from ljn.runs.checkpoints import read_checkpoint
-from ljn.tasks.evaluate import evaluate
+from ljn.runs.packages import find_package
+from ljn.tasks.evaluate import evaluate, evaluate_checkpoint
 from ljn.tasks.overrides import with_checkpoint_config
 
 
@@ -95,3 +96,29 @@ def test_other_bodies_reach_all_that_was_made_of_the_bodies_group(write_checkpoi
     assert (merged.data.body_path, merged.module.body_path) == ("bodies", "bodies")
     assert (merged.data.source.genders, merged.module.genders) == (["male"], ["male"])
     assert merged.module.predicted == "male"
+
+
+def test_refined_meshes_have_metrics_beside_the_others(smoke_config, tmp_path):
+    call = ("task=evaluate", "weights=small", "task.stage=mesh", "data.num_test=8", "data.num_workers=0")
+    typed = ["data.num_test=8", "data.num_workers=0"]
+    path = find_package("small", "weights")
+    cfg = smoke_config(tmp_path, *call, "refine=true")
+    metrics = evaluate_checkpoint(cfg, path, typed, stage="mesh")
+    assert metrics["test/refined_apve_camera"] < 0.8 * metrics["test/apve_camera"]
+    assert metrics["test/refined_mpjpe_camera"] < metrics["test/mpjpe_camera"]
+    record = json.loads((tmp_path / cfg.paths.run_dir / "record.json").read_text())
+    assert record["refine"] == "accurate"
+    assert record["metrics"]["refined_harmed"]["unit"] == "%"
+    plain = smoke_config(tmp_path, *call)
+    raw = evaluate_checkpoint(plain, path, typed, stage="mesh")
+    assert plain.paths.run_dir != cfg.paths.run_dir
+    assert raw == {name: value for name, value in metrics.items() if "refined" not in name}
+
+
+def test_joints_alone_are_not_refined(smoke_config, tmp_path):
+    cfg = smoke_config(tmp_path, "task=evaluate", "weights=small", "refine=fast", "data.num_workers=0")
+    with pytest.raises(ValueError, match=r"refine: 'fast' fits meshes, and .* is no mesh regressor"):
+        evaluate(cfg)
+    cfg.refine = "slow"
+    with pytest.raises(ValueError, match="refine: expected true, false, accurate or fast, got 'slow'"):
+        evaluate(cfg)
