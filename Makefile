@@ -6,7 +6,7 @@ BIN := $(VENV)/bin
 .PHONY: demo train-demo test lint bench install clean
 
 demo: install
-	$(BIN)/python run.py task=demo
+	$(BIN)/python run.py task=demo refine=true
 
 train-demo: install
 	$(BIN)/python run.py sweep=demo

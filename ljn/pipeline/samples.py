@@ -15,6 +15,7 @@ from ljn.body.skeleton import NUM_JOINTS, ROOT
 from ljn.geometry.camera import Camera, place_at_root
 from ljn.pipeline.frames import FrameFiles, find_frames
 from ljn.pipeline.inputs import read_camera
+from ljn.pipeline.pipeline import Prediction
 from ljn.reading import READ_ERRORS, read_arrays, reason
 
 CAMERA, DEPTH, KEYPOINTS, TRUTH = "camera.yaml", "depth", "keypoints", "truth"
@@ -58,6 +59,43 @@ class Truth(NamedTuple):
         posed = body(*(torch.from_numpy(values).double()[None] for values in (self.pose, self.betas)))
         root = torch.from_numpy(self.joints[ROOT]).double()
         return place_at_root(posed.vertices[0], posed.joints[0, ROOT], root).numpy()
+
+
+def pseudo_label(prediction: Prediction, body: SMPL, max_residual_mm: float = 5.0) -> Truth | None:
+    """What a refined prediction says of a real image of which nothing is known, where it can be relied on.
+
+    For training on unlabelled depth, or to check labels; `write_sample` writes it with its image.
+
+    Args:
+        prediction: Of one image, by a pipeline that refines.
+        body: The body that it is a mesh of: the regressor's.
+        max_residual_mm: The largest median distance of the cloud to the mesh.
+
+    Returns:
+        None where the fit was given up, or leaves more.
+
+    Raises:
+        ValueError: The prediction is not refined, or is a batch.
+    """
+    values = (
+        prediction.is_refined,
+        prediction.residual_mm,
+        prediction.mesh_joints,
+        prediction.pose,
+        prediction.betas,
+    )
+    is_refined, residual_mm, joints, pose, betas = values
+    if is_refined is None or residual_mm is None or joints is None or pose is None or betas is None:
+        raise ValueError(
+            "prediction: expected one of a pipeline that refines, Pipeline.load(..., refine=True)"
+        )
+    if joints.ndim != 2:
+        raise ValueError(
+            f"prediction: expected that of one image, got a batch of {len(joints)}; take them one by one"
+        )
+    if not is_refined or residual_mm[1] > max_residual_mm:
+        return None
+    return Truth(joints, pose, betas, body.genders[0], body.hash)
 
 
 class SampleFiles(NamedTuple):

@@ -6,7 +6,7 @@ from ljn.cloud.observation import MIRRORED, mirror_observations
 from ljn.demo import FRAMES
 from ljn.pipeline.frames import FrameFiles
 from ljn.pipeline.pipeline import Pipeline
-from ljn.pipeline.samples import find_samples, read_truth
+from ljn.pipeline.samples import find_samples, pseudo_label, read_truth, write_camera, write_sample
 from ljn.refinement import Refined, refine
 
 
@@ -37,6 +37,24 @@ def test_meshes_of_the_frames_that_ship_come_nearer_to_the_truth(shipped):
         errors.append([error_mm(guessed, truth), error_mm(fitted, truth)])
     before, after = np.mean(errors, 0)
     assert after < 0.75 * before
+
+
+def test_a_good_fit_becomes_a_label(shipped, tmp_path):
+    camera, images, truth = next(frames())
+    found = shipped(images.depth, camera)
+    body = shipped.regressor.module.body
+    label = pseudo_label(found, body)
+    assert label.gender == "neutral"
+    np.testing.assert_allclose(label.vertices(), found.vertices, atol=1e-5)
+    assert np.linalg.norm(label.joints - truth.joints, axis=-1).mean() < 0.04
+    write_camera(tmp_path, camera)
+    write_sample(tmp_path, "labelled", images.depth, np.zeros((24, 2)).tolist(), label)
+    np.testing.assert_array_equal(read_truth(tmp_path / "truth" / "labelled.npz").pose, label.pose)
+    assert pseudo_label(found, body, max_residual_mm=0.01) is None
+    with pytest.raises(ValueError, match="expected one of a pipeline that refines"):
+        pseudo_label(Pipeline(shipped.detector, shipped.regressor)(images.depth, camera), body)
+    with pytest.raises(ValueError, match="got a batch of 2"):
+        pseudo_label(shipped(np.stack([images.depth] * 2), camera), body)
 
 
 def test_a_batch_is_refined_as_its_images_are(shipped):
