@@ -83,7 +83,8 @@ def test_a_batch_keeps_its_contract(batch):
         "joints": (12, 24, 3), "pose": (12, 72), "betas": (12, 10), "gender": (12,), "camera": (12, 4),
         "sample_id": (12,),
     }  # fmt: skip
-    assert set(batch) == set(Batch.__annotations__) - {"crop", "crop_camera", "confidences"} == set(shapes)
+    others = {"crop", "crop_camera", "confidences", "lifted_joints"}
+    assert set(batch) == set(Batch.__annotations__) - others == set(shapes)
     for name, shape in shapes.items():
         assert batch[name].shape == shape, name
         assert batch[name].dtype == (torch.int64 if name in ("gender", "sample_id") else torch.float32), name

@@ -81,7 +81,7 @@ def test_weights_that_do_not_fit_the_demonstration_are_refused(
 
 def test_make_demo_shows_the_weights_that_ship_and_make_train_demo_trains():
     makefile = (ROOT / "Makefile").read_text()
-    assert re.search(r"^demo: install\n\t.*run\.py task=demo$", makefile, re.MULTILINE)
+    assert re.search(r"^demo: install\n\t.*run\.py task=demo refine=true$", makefile, re.MULTILINE)
     assert re.search(r"^train-demo: install\n\t.*run\.py sweep=demo$", makefile, re.MULTILINE)
 
 
