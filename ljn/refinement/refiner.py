@@ -25,20 +25,22 @@ from torch import Tensor, nn
 from torch.nn.functional import normalize
 
 from ljn.body import SMPL
+from ljn.geometry.points import gather_points
 from ljn.geometry.rotations import CAMERA_FROM_BODY
 from ljn.refinement.prior import guess_precision
-from ljn.refinement.surface import BodyState, BodySurface, PosedSurface, _of
+from ljn.refinement.surface import BodyState, BodySurface, PosedSurface
 
 _TURN_M2 = 0.02  # of a normal's disagreement, 1 - cosine, beside a squared distance
 _FACING = 0.1  # cosine between a normal and the ray, up to which a vertex may be seen
 _EVERY = 4  # points of which one asks for its vertex itself, not for its plane alone
-_OUTLINE_PX = 0.5  # within this of the body, a pixel counts as the body's
+_OUTLINE_PX = 0.7  # from a vertex to the middle of a pixel of the body, up to which it counts as on it
 _DAMPING = 1e-4  # of the normal equations' diagonal
 _AT_ONCE = {"cpu": 8}  # samples, for a cache's sake
 # A fit is given up that explains hardly anything, or little although it has gone far from its guess: as often as not it
 # is the worse one. One that has not gone far may have foreign points before it.
 _HOPELESS, _DOUBTFUL, _FAR_CHANGE = 0.7, 0.3, 200.0  # misfits; squared Mahalanobis distance
 _FAR_M = 0.05  # points farther from the mesh count as unexplained
+_TANGENT_M = 0.02  # radius of a vertex's share of the surface: within it, its plane stands for the mesh
 
 
 @dataclass(frozen=True)
@@ -153,7 +155,14 @@ class Refiner(nn.Module):
             betas: `(B, 10)`, the guessed shape.
             joints: `(B, 24, 3)`, the joints as detected, metres, camera frame: the guess's place is where its joints
                 lie nearest to them.
+
+        Raises:
+            ValueError: The guess or the joints are not finite.
         """
+        if not all(bool(value.isfinite().all()) for value in (rotmats, betas, joints)):
+            raise ValueError(
+                "refine: NaN or infinite values in the guess; the networks' weights or input are broken"
+            )
         dtype = self.precision.dtype
         with torch.autocast(rotmats.device.type, enabled=False):
             values = [observation[name] for name in self.takes]
@@ -196,11 +205,10 @@ class Refiner(nn.Module):
         after = self._explained(self._match(seen, self.surface(state)))
         assert before is not None
 
-        is_finite = torch.cat([value.flatten(1) for value in state], 1).isfinite().all(1)
         moved = state.change_from(guess)
         is_far = (moved @ self.precision * moved).sum(-1) > _FAR_CHANGE
         is_given_up = (after.misfit > _HOPELESS) | is_far & (after.misfit > _DOUBTFUL)
-        is_kept = is_finite & (after.misfit < before.misfit) & ~is_given_up
+        is_kept = (after.misfit < before.misfit) & ~is_given_up
         chosen = BodyState(
             *(
                 torch.where(is_kept.view(-1, *[1] * (new.ndim - 1)), new, old)
@@ -219,8 +227,8 @@ class Refiner(nn.Module):
     def _match(self, seen: "_Seen", posed: PosedSurface) -> "_Match":
         is_facing = (posed.normals * normalize(posed.vertices, dim=-1)).sum(-1) < _FACING
         index = nearest_vertices(seen.points, seen.normals, posed.vertices, posed.normals, is_facing)
-        normals = _of(posed.normals, index)
-        offsets = _of(posed.vertices, index) - seen.points
+        normals = gather_points(posed.normals, index)
+        offsets = gather_points(posed.vertices, index) - seen.points
         agreement = (seen.normals * normals).sum(-1).clamp(min=0)
         return _Match(index, normals, offsets, (offsets * normals).sum(-1), agreement)
 
@@ -240,7 +248,9 @@ class Refiner(nn.Module):
         system = system + _DAMPING * torch.diag_embed(system.diagonal(dim1=-2, dim2=-1))
         gradient = (residual[:, None] @ rows).squeeze(1) + moved @ prior
         factor = torch.linalg.cholesky_ex(system).L
-        return -torch.cholesky_solve(gradient[..., None], factor).squeeze(-1)
+        change = -torch.cholesky_solve(gradient[..., None], factor).squeeze(-1)
+        # Where a system cannot be solved the body stays.
+        return change.where(change.isfinite().all(-1, keepdim=True), 0.0)
 
     def _cloud(self, match: "_Match", scale_m: float) -> list[tuple[Tensor, Tensor, Tensor]]:
         """Vertices, directions and residuals of the cloud's terms, weighted."""
@@ -267,7 +277,7 @@ class Refiner(nn.Module):
         nearest = seen.nearest.gather(1, pixel.long())
         across, down = column - nearest % size, row - torch.div(nearest, size, rounding_mode="floor")
         distance_px = torch.hypot(across, down)
-        outside = (distance_px - _OUTLINE_PX * 2**0.5).clamp(min=0) / distance_px.clamp(min=1e-6)
+        outside = (distance_px - _OUTLINE_PX).clamp(min=0) / distance_px.clamp(min=1e-6)
         across, down = across * outside * depth / fx, down * outside * depth / fy  # metres
         squared = across.square() + down.square()
         weight = robust_weight(squared, settings.outline_scale_m)
@@ -275,7 +285,7 @@ class Refiner(nn.Module):
         index = (weight * squared).topk(count, -1).indices
         weight = settings.cloud_weight * settings.outline_share * weight.gather(1, index) / squared.shape[1]
         weight = weight.sqrt()
-        vertices = _of(posed.vertices, index)
+        vertices = gather_points(posed.vertices, index)
         rays = vertices[..., :2] / vertices[..., 2:].clamp(min=0.1)
         zero = torch.zeros_like(weight)
         # Of x / z at a fixed scale z: dx - (x / z) dz.
@@ -299,9 +309,6 @@ class Refiner(nn.Module):
         return _Explained(
             disagrees.mean(-1), 1000 * distance.median(-1).values, (distance > _FAR_M).to(squared).mean(-1)
         )
-
-
-_TANGENT_M = 0.02  # radius of a vertex's share of the surface: within it, its plane stands for the mesh
 
 
 class _Seen:

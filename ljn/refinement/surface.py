@@ -13,7 +13,7 @@ from torch.nn.functional import normalize
 from ljn.body import SMPL
 from ljn.body.files import NUM_BETAS
 from ljn.body.skeleton import LEVELS, NUM_JOINTS, PARENTS, ROOT
-from ljn.geometry.points import farthest_point_sampling
+from ljn.geometry.points import farthest_point_sampling, gather_points
 from ljn.geometry.rotations import rotmat_to_rotvec, rotvec_to_rotmat
 
 NUM_CHANGES = 3 * NUM_JOINTS + NUM_BETAS + 3
@@ -165,7 +165,7 @@ class BodySurface(nn.Module):
         return self._rows_as_tensors(posed, index, directions)
 
     def _rows_as_tensors(self, posed: PosedSurface, index: Tensor, directions: Tensor) -> Tensor:
-        weights, unposed = self._weights[index], _of(posed.unposed, index)
+        weights, unposed = self._weights[index], gather_points(posed.unposed, index)
         at = torch.einsum("bkij,bmj->bmki", posed.rotations, unposed) + posed.offsets[:, None]
         # Of each joint: the part of a vertex that it and the joints below it carry, about it.
         arm = self._below @ (weights[..., None] * at)
@@ -173,7 +173,7 @@ class BodySurface(nn.Module):
         # d . (R w x arm) = R^T (arm x d) . w
         turns = torch.linalg.cross(arm, directions[..., None, :].expand_as(arm))
         turns = torch.einsum("bkij,bmki->bmkj", posed.rotations, turns).flatten(2)
-        shapes = _of(posed.blended, index) @ self._shapes[index]
+        shapes = gather_points(posed.blended.flatten(2), index).unflatten(-1, (3, 3)) @ self._shapes[index]
         shapes = shapes + torch.einsum("bmk,bkil->bmil", weights, posed.joint_shapes)
         return torch.cat([turns, (directions[..., None, :] @ shapes).squeeze(-2), directions], -1)
 
@@ -187,12 +187,6 @@ class BodySurface(nn.Module):
         )
         kernels.jacobian_rows(*(field.detach().contiguous().numpy() for field in fields))
         return out
-
-
-def _of(values: Tensor, index: Tensor) -> Tensor:
-    """`(B, U, ...)` and `(B, M)` long -> `(B, M, ...)`."""
-    index = index.view(*index.shape, *[1] * (values.ndim - 2))
-    return values.gather(1, index.expand(-1, -1, *values.shape[2:]))
 
 
 def _vertex_normals(vertices: Tensor, faces: Tensor) -> Tensor:

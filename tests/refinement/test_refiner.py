@@ -141,6 +141,12 @@ def test_it_computes_in_the_bodys_precision(body, depth, guess):
     assert refined.root.dtype == torch.float64
 
 
+def test_a_broken_guess_is_an_error(depth, refiner, guess):
+    rotmats, betas, joints = guess
+    with pytest.raises(ValueError, match="refine: NaN or infinite values in the guess"):
+        refiner(seen_of(depth), rotmats, torch.full_like(betas, torch.nan), joints)
+
+
 def test_nearest_vertices_agree_with_tensors():
     generator = torch.Generator().manual_seed(0)
     points, vertices = torch.randn(2, 50, 3, generator=generator), torch.randn(2, 80, 3, generator=generator)
