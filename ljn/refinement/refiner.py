@@ -87,7 +87,7 @@ class RefinementSettings:
 
 SETTINGS: Mapping[str, RefinementSettings] = {
     "accurate": RefinementSettings(),
-    "fast": RefinementSettings(num_steps=4, num_points=512, num_outline=48),
+    "fast": RefinementSettings(num_steps=3, num_points=640, num_outline=48),
 }
 """The settings by name."""
 
