@@ -199,7 +199,7 @@ from ljn import Camera, Pipeline
 assert ljn.__file__.startswith(sys.argv[1]), ljn.__file__
 depth = np.zeros((512, 424), np.float32)
 depth[100:400, 180:240] = 2
-pipeline = Pipeline.from_pretrained("small")
+pipeline = Pipeline.from_pretrained("small", refine=True)
 print(pipeline(depth, Camera(366, 366, 206, 253, 424, 512)).vertices.shape)
 """
 
