@@ -93,11 +93,9 @@ class MeshRegressor(StageModule):
 
         Args:
             refiner: What fits, of the predicted body.
-            detect: The detector whose joints the batches hold, for a second look; see `ljn.refinement.looks`.
+            detect: The `second_look` of the detector whose joints the batches hold.
         """
-        self.refiner = refiner
-        # Not as a module of this one, whose state would have to hold it.
-        self.detect = None if detect is None else lambda seen: detect(seen)
+        self.refiner, self.detect = refiner, detect
         self.metrics = RefinedMeshMetrics  # type: ignore[misc]
         self.val_metrics = RefinedMeshMetrics(prefix="val/")
         self.test_metrics = RefinedMeshMetrics(prefix="test/")

@@ -9,14 +9,14 @@ import numpy as np
 import torch
 
 from ljn.body.skeleton import ROOT
-from ljn.cloud.observation import MIRRORED, Observation, ObservationRecipe, observe, stack_observations
+from ljn.cloud.observation import Observation, ObservationRecipe, observe, stack_observations
 from ljn.geometry.camera import Camera, place_at_root
 from ljn.geometry.rotations import rotmat_to_rotvec
 from ljn.modules.joint_detector import JointDetector
 from ljn.modules.mesh_regressor import MeshRegressor
 from ljn.pipeline.depth import body_depth
 from ljn.pipeline.keypoints import MIN_KNOWN, check_place, smpl_keypoints
-from ljn.refinement import Refiner, chosen_settings, refine
+from ljn.refinement import Refiner, chosen_settings, refine, second_look
 from ljn.runs.checkpoints import Checkpoint, load_module
 from ljn.runs.packages import DEFAULT, find_package, stages_of
 
@@ -307,10 +307,10 @@ class Pipeline:
         if self.refiner is not None:
             detector = self.detector.module
             # A second look at points alone would be at those of the detector's recipe.
-            looks_twice = set(detector.takes) <= MIRRORED and set(regressor.takes) <= {"initial_joints"}
+            detect = second_look(detector) if set(regressor.takes) <= {"initial_joints"} else None
             refined, joints = refine(
                 *(self.refiner, _on(detector.device, detected), joints, (rotmats, betas)),
-                *(detector if looks_twice else None, regress),
+                *(detect, regress),
             )
             rotmats, betas, root = refined.rotmats, refined.betas, refined.root
             made = {"is_refined": refined.is_kept, "residual_mm": refined.residual_mm}

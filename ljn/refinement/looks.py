@@ -1,6 +1,7 @@
 """A fit with a second look: where the first does not explain the image, the detector sees it in a mirror."""
 
 from collections.abc import Callable, Mapping
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -9,13 +10,19 @@ from ljn.cloud.observation import MIRRORED, mirror_observations
 from ljn.refinement.refiner import Refined, Refiner
 
 DOUBT = 0.2
-"""Misfit of a fit, from which on a second look is taken: that of one in fifteen bodies seen without keypoints, and of
-one in a hundred seen with them, which are 0.28 m off in the mean."""
+"""Misfit of a fit, from which on a second look is taken: some two bodies in a hundred seen without keypoints."""
 
 Detect = Callable[[Mapping[str, Tensor]], Tensor]
 """Joints `(B, 24, 3)`, metres, camera frame, of a batch of observations."""
 Regress = Callable[[Mapping[str, Tensor]], tuple[Tensor, Tensor]]
 """Pose `(B, 24, 3, 3)` and shape `(B, 10)` of a batch of observations whose `initial_joints` are the detector's."""
+
+
+def second_look(detector: Any) -> Detect | None:
+    """What sees mirrored images for `refine`; None without a detector, or where what it takes cannot be mirrored."""
+    if detector is None or not set(detector.takes) <= MIRRORED:
+        return None
+    return lambda seen: detector(seen)  # not the module itself, which its keeper's state would have to hold
 
 
 @torch.no_grad()
@@ -36,7 +43,7 @@ def refine(
         seen: The observations, for the detector, the regressor and the refiner.
         joints: `(B, 24, 3)`, what the detector found, metres, camera frame.
         guess: Pose `(B, 24, 3, 3)` and shape `(B, 10)` that the regressor made of it.
-        detect: The detector; None for one look alone.
+        detect: See `second_look`; None for one look alone.
         regress: The regressor.
 
     Returns:

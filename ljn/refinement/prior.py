@@ -25,10 +25,10 @@ def guess_precision(body_hash: str, covariance: np.ndarray | None = None) -> Ten
             else: theirs are taken to be independent of pose and place, with a variance of 1.
         covariance: `(85, 85)`, another one; None: the measured.
     """
-    measured, hashes = (covariance, (body_hash,)) if covariance is not None else _measured()
+    measured, measured_hash = (covariance, body_hash) if covariance is not None else _measured()
     covariance = measured.astype(np.float64)
     covariance[np.diag_indices(NUM_CHANGES)] *= 1 + _RIDGE
-    if body_hash not in hashes:
+    if body_hash != measured_hash:
         shape = slice(3 * NUM_JOINTS, 3 * NUM_JOINTS + NUM_BETAS)
         covariance[shape] = 0
         covariance[:, shape] = 0
@@ -37,6 +37,6 @@ def guess_precision(body_hash: str, covariance: np.ndarray | None = None) -> Ten
 
 
 @cache
-def _measured() -> tuple[np.ndarray, tuple[str, ...]]:
+def _measured() -> tuple[np.ndarray, str]:
     with np.load(PATH, allow_pickle=False) as arrays:
-        return arrays["covariance"], (str(arrays["body"]),)
+        return arrays["covariance"], str(arrays["body"])

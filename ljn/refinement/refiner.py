@@ -15,7 +15,6 @@ point's pixel is another limb's where the guess is a limb's width off.
 """
 
 from collections.abc import Mapping
-from copy import copy
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -35,7 +34,7 @@ _FACING = 0.1  # cosine between a normal and the ray, up to which a vertex may b
 _EVERY = 4  # points of which one asks for its vertex itself, not for its plane alone
 _OUTLINE_PX = 0.7  # from a vertex to the middle of a pixel of the body, up to which it counts as on it
 _DAMPING = 1e-4  # of the normal equations' diagonal
-_AT_ONCE = {"cpu": 8}  # samples, for a cache's sake
+_AT_ONCE = 8  # samples on a CPU, for its cache's sake
 # A fit is given up that explains hardly anything, or little although it has gone far from its guess: as often as not it
 # is the worse one. One that has not gone far may have foreign points before it.
 _HOPELESS, _DOUBTFUL, _FAR_CHANGE = 0.7, 0.3, 200.0  # misfits; squared Mahalanobis distance
@@ -167,7 +166,7 @@ class Refiner(nn.Module):
         with torch.autocast(rotmats.device.type, enabled=False):
             values = [observation[name] for name in self.takes]
             values = [value.to(dtype) for value in (*values, rotmats, betas, joints)]
-            step = _AT_ONCE.get(rotmats.device.type, len(rotmats)) or 1
+            step = _AT_ONCE if rotmats.device.type == "cpu" else max(1, len(rotmats))
             parts = [self._fit(*part) for part in zip(*(value.split(step) for value in values))]
             return Refined(*(torch.cat(part) for part in zip(*parts)))
 
@@ -189,21 +188,19 @@ class Refiner(nn.Module):
     ) -> Refined:
         settings = self.settings
         seen = _Seen(points[:, : settings.num_points], crop, crop_camera)
-        coarse = seen.with_points(points[:, : max(1, settings.num_points // 2)])
-        guess = self.guess(rotmats, betas, joints)
+        state = guess = self.guess(rotmats, betas, joints)
+        posed = self.surface(state)
+        match = self._match(seen, posed)
+        before = self._explained(match)
         first, last = settings.scales_m
-        state, before = guess, None
         for step in range(settings.num_steps):
-            share = step / max(1, settings.num_steps - 1)
+            scale = first * (last / first) ** (step / max(1, settings.num_steps - 1))
+            state = state.moved(self._step(seen, posed, match, state.change_from(guess), scale))
             posed = self.surface(state)
             # Half of the points lead as near as the last steps need.
-            now = seen if step in (0, *range(2 * settings.num_steps // 3, settings.num_steps)) else coarse
-            match = self._match(now, posed)
-            before = before or self._explained(match)
-            change = self._step(seen, posed, match, state.change_from(guess), first * (last / first) ** share)
-            state = state.moved(change)
-        after = self._explained(self._match(seen, self.surface(state)))
-        assert before is not None
+            is_rough = step + 1 < 2 * settings.num_steps // 3
+            match = self._match(seen, posed, max(1, settings.num_points // 2) if is_rough else None)
+        after = self._explained(match)
 
         moved = state.change_from(guess)
         is_far = (moved @ self.precision * moved).sum(-1) > _FAR_CHANGE
@@ -224,12 +221,14 @@ class Refiner(nn.Module):
         misfit = torch.where(is_kept, after.misfit, before.misfit)
         return Refined(turned, chosen.betas, chosen.root, is_kept, misfit, *both)
 
-    def _match(self, seen: "_Seen", posed: PosedSurface) -> "_Match":
+    def _match(self, seen: "_Seen", posed: PosedSurface, num_points: int | None = None) -> "_Match":
+        """Match the first points of the cloud; None: all of them."""
+        points, point_normals = seen.points[:, :num_points], seen.normals[:, :num_points]
         is_facing = (posed.normals * normalize(posed.vertices, dim=-1)).sum(-1) < _FACING
-        index = nearest_vertices(seen.points, seen.normals, posed.vertices, posed.normals, is_facing)
+        index = nearest_vertices(points, point_normals, posed.vertices, posed.normals, is_facing)
         normals = gather_points(posed.normals, index)
-        offsets = gather_points(posed.vertices, index) - seen.points
-        agreement = (seen.normals * normals).sum(-1).clamp(min=0)
+        offsets = gather_points(posed.vertices, index) - points
+        agreement = (point_normals * normals).sum(-1).clamp(min=0)
         return _Match(index, normals, offsets, (offsets * normals).sum(-1), agreement)
 
     def _step(
@@ -315,19 +314,10 @@ class _Seen:
     """What the fit is made to: points, normals, and for each pixel of the crop the nearest of the body."""
 
     def __init__(self, points: Tensor, crop: Tensor, camera: Tensor) -> None:
-        self._take(points)
+        self.points, self.normals = points.split(3, -1)
         self.camera = camera
         self.size = crop.shape[-1]
         self.nearest = nearest_pixels(crop > 0).flatten(1)
-
-    def _take(self, points: Tensor) -> None:
-        self.points, self.normals = (part.contiguous() for part in points.split(3, -1))
-
-    def with_points(self, points: Tensor) -> "_Seen":
-        """The same with other points `(B, N, 6)`."""
-        seen = copy(self)
-        seen._take(points)
-        return seen
 
 
 class _Match(NamedTuple):

@@ -54,7 +54,8 @@ def demo(cfg: DictConfig) -> dict[str, float]:
     frames, `turntable.gif` the first frame's mesh with its cloud, and a table the errors.
 
     Args:
-        cfg: The composed configuration; of it `task`, `ckpt_path`, `weights`, `body.path`, `paths` and `num_threads`.
+        cfg: The composed configuration; of it `task`, `ckpt_path`, `weights`, `refine`, `body.path`, `paths` and
+            `num_threads`.
 
     Returns:
         No metrics: they are in the table, which is printed.

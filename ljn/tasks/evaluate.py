@@ -7,12 +7,9 @@ import torch
 from omegaconf import DictConfig
 
 from ljn.building import build
-from ljn.cloud.observation import MIRRORED
 from ljn.data import DataModule
-from ljn.modules.joint_detector import JointDetector
 from ljn.modules.mesh_regressor import MeshRegressor
-from ljn.refinement import Refiner, chosen_settings
-from ljn.refinement.looks import Detect
+from ljn.refinement import Refiner, chosen_settings, second_look
 from ljn.runs import layout
 from ljn.runs.checkpoints import Checkpoint, load_state, read_checkpoint
 from ljn.runs.files import read_metrics, write_json
@@ -70,14 +67,13 @@ def evaluate_checkpoint(
     an equal evaluation, if there is a complete one, is taken instead.
     """
     checkpoint = read_checkpoint(path, stage=stage)
-    chosen_settings(cfg.refine)  # before work starts
+    settings = chosen_settings(cfg.refine)
     call, cfg = cfg, with_checkpoint_config(cfg, checkpoint, overrides)
     cfg.name = name or cfg.name
     validate(cfg)
 
     datamodule: DataModule = build(cfg.data)
     datamodule.prepare_data()
-    settings = chosen_settings(call.refine)
     evaluated = {**identity(cfg, datamodule.fingerprint), "checkpoint": checkpoint.file_hash}
     if settings is not None:
         evaluated["refine"] = settings
@@ -107,7 +103,7 @@ def _evaluate(
                 f"refine: {cfg.refine!r} fits meshes, and '{checkpoint.path}' is no mesh regressor; give one's "
                 "checkpoint, or of weights task.stage=mesh"
             )
-        module.refine_with(Refiner(module.body, settings), _second_look(datamodule))
+        module.refine_with(Refiner(module.body, settings), second_look(datamodule.detector))
         datamodule.takes = module.observes
     else:
         datamodule.takes = module.takes
@@ -135,9 +131,3 @@ def _evaluate(
             write_json(run_dir / layout.METRICS, metrics)
     _LOG.info("%s on %s: %s", checkpoint.run, cfg.name, run_dir)
     return metrics
-
-
-def _second_look(datamodule: DataModule) -> Detect | None:
-    """The data's detector, where it can see an image in a mirror."""
-    detector = datamodule.detector
-    return detector if isinstance(detector, JointDetector) and set(detector.takes) <= MIRRORED else None
