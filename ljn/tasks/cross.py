@@ -46,7 +46,7 @@ def cross(cfg: DictConfig) -> dict[str, float]:
         detector = trained(composed(task.detector), task.detector)
         overrides.append(f"data.detector_ckpt={quoted(detector)}")
     alone = cfg.copy()
-    alone.task.detector = None  # it is for the test
+    alone.task.detector = alone.refine = None  # they are for the test
     return evaluate_checkpoint(cfg, trained(alone, task.trains), overrides, cfg.name, reuses=True)
 
 

@@ -9,6 +9,7 @@ from omegaconf import DictConfig, open_dict
 
 from ljn.building import build
 from ljn.data import DataModule
+from ljn.refinement import chosen_settings
 from ljn.runs import layout
 from ljn.runs.checkpoints import Checkpoint, load_state, read_checkpoint
 from ljn.runs.files import read_metrics, write_json
@@ -40,6 +41,11 @@ def train(cfg: DictConfig) -> dict[str, float]:
             raise ValueError(
                 f"{key}: it is what task=evaluate reads; a training resumes from its own directory by itself"
             )
+    if chosen_settings(cfg.refine) is not None:
+        raise ValueError(
+            f"refine: {cfg.refine!r} fits meshes of task=predict, evaluate and demo, not of a training; leave it "
+            "out, and evaluate the run with it"
+        )
     validate(cfg)
     initial = _earlier_stages(cfg)
     datamodule: DataModule = build(cfg.data)

@@ -153,6 +153,10 @@ def test_the_weights_that_ship_are_the_default(shipped, image, smoke_config, tmp
 def test_weights_are_not_for_training(smoke_config, tmp_path):
     with pytest.raises(ValueError, match="weights: it is what task=evaluate reads"):
         train(smoke_config(tmp_path, "weights=small"))
+    with pytest.raises(
+        ValueError, match="refine: 'fast' fits meshes of task=predict, evaluate and demo, not of a"
+    ):
+        train(smoke_config(tmp_path, "refine=fast"))
 
 
 @pytest.mark.parametrize(
