@@ -13,8 +13,9 @@ from torch import Tensor
 from datamodules.noise import JOINT_NOISES, add_depth_noise, add_joint_noise, add_keypoint_noise
 from datamodules.placement import HEADINGS, check_margin, draw_heading, place
 from datamodules.scenes import KeptScenes, Scene, mirrored
+from datamodules.sensor import Sensor
 from datamodules.sources import PoseRecords
-from ljn.body import SMPL, BodyModel, SparseSMPL
+from ljn.body import GENDERS, SMPL, BodyModel, SparseSMPL
 from ljn.body.skeleton import NUM_JOINTS
 from ljn.cloud.observation import ObservationRecipe, observe, stack_observations
 from ljn.data import Batch
@@ -24,7 +25,7 @@ from ljn.pipeline.keypoints import fill_missing
 from ljn.render import RENDERERS, Renderer, get_renderer
 
 # Each purpose has a generator of its own: changing one (the number of points, a sigma) leaves the others' draws.
-_PLACEMENT, _DEPTH_NOISE, _SAMPLING, _KEYPOINTS, _JOINTS, _MISSING, _CAMERA = range(7)
+_PLACEMENT, _DEPTH_NOISE, _SAMPLING, _KEYPOINTS, _JOINTS, _MISSING, _CAMERA, _PERSON, _SENSOR = range(9)
 
 SampleKey = tuple[int, ...]
 """An epoch, a record's index and, where a render is used again, the number of that use; without it, the first, 0."""
@@ -47,7 +48,7 @@ class SynthesisSettings:
         heading: `histogram`, `uniform` or `source`; see `draw_heading`.
         distance_m: Range of the depth of the body's centre, metres.
         margin_px: Clear border around the body, pixels.
-        depth_noise_m: Standard deviation of the depth noise, metres.
+        depth_noise_m: Standard deviation of the depth noise of the sensor `gaussian`, metres; others have their own.
         keypoint_noise_px: Standard deviation of the keypoints' noise, pixels; of a sample with another focal length in
             proportion to it.
         missing_keypoints: Shares of the keypoints, one of which is missing in a sample, each keypoint by itself; those
@@ -128,6 +129,8 @@ class DepthSynthesizer:
         seed_key: What the random draws depend on, beside a sample's epoch and index: a seed and a split number.
         dtype: Precision of the body; float64 makes fixed sets agree across machines.
         num_kept: How many batches' renders are kept, for batches of the same bodies to come.
+        sensor: What becomes of bodies and images before they are observed; None for `gaussian`, the thesis's: noise of
+            `settings.depth_noise_m` on the body, and nothing else.
     """
 
     def __init__(
@@ -141,6 +144,7 @@ class DepthSynthesizer:
         seed_key: tuple[int, int],
         dtype: torch.dtype = torch.float32,
         num_kept: int = 0,
+        sensor: Sensor | None = None,
     ) -> None:
         if settings.heading == "source" and not records.has_heading:
             raise ValueError(
@@ -156,6 +160,7 @@ class DepthSynthesizer:
         self.seed_key = seed_key
         self.dtype = dtype
         self.num_kept = num_kept
+        self.sensor = sensor
 
     def __getstate__(self) -> dict[str, Any]:
         lazy = ("_smpl", "_renderer", "_kept")
@@ -174,8 +179,11 @@ class DepthSynthesizer:
         return KeptScenes(self.num_kept)
 
     def _rng(self, key: SampleKey, purpose: int) -> np.random.Generator:
+        return np.random.default_rng(self._seed(key, purpose))
+
+    def _seed(self, key: SampleKey, purpose: int) -> list[int]:
         epoch, index, *use = key
-        return np.random.default_rng([*self.seed_key, epoch, index, purpose, *(use if any(use) else ())])
+        return [*self.seed_key, epoch, index, purpose, *(use if any(use) else ())]
 
     def batch(self, keys: Sequence[SampleKey]) -> Batch:
         """The samples of `keys`.
@@ -224,11 +232,17 @@ class DepthSynthesizer:
         pose = torch.from_numpy(self.records.pose[rows]).to(self.dtype)
         heading = torch.tensor([draw_heading(settings.heading, rng) for rng in placement], dtype=self.dtype)
         root = rotation_about("z", heading) @ rotvec_to_rotmat(pose[:, :3])
-        pose = torch.cat([rotmat_to_rotvec(root), pose[:, 3:]], -1)
         betas = torch.from_numpy(self.records.betas[rows]).to(self.dtype)
+        if self.sensor is not None:
+            root, betas = self._as_seen(keys, root, betas)
+        pose = torch.cat([rotmat_to_rotvec(root), pose[:, 3:]], -1)
 
         gender = torch.from_numpy(self.records.gender[rows])
         vertices, joints = self._smpl(pose, betas, gender)
+        if self.sensor is not None and with_depth:
+            vertices = vertices.contiguous()
+            for mesh, key, row in zip(vertices.numpy(), keys, gender.tolist()):
+                self.sensor.dress(mesh, self._body_of[row], self._seed(key, _PERSON))
         vertices, joints = body_to_camera(vertices), body_to_camera(joints)
         transl = torch.from_numpy(
             np.stack(
@@ -244,6 +258,23 @@ class DepthSynthesizer:
         else:
             depth = [np.zeros((0, 0), np.float32)] * len(keys)
         return Scene(pose, betas, gender, joints, cameras, depth)
+
+    def _as_seen(self, keys: Sequence[SampleKey], root: Tensor, betas: Tensor) -> tuple[Tensor, Tensor]:
+        """The roots' rotations `(B, 3, 3)` and shapes `(B, 10)` that the sensor makes of others."""
+        assert self.sensor is not None
+        root, betas = root.clone(), betas.clone()
+        for i, key in enumerate(keys):
+            seed = self._seed(key, _PERSON)
+            turned = self.sensor.turn(seed)
+            if turned is not None:
+                root[i] = torch.from_numpy(turned).to(root) @ root[i]
+            betas[i] = torch.from_numpy(self.sensor.shape(betas[i].numpy(), seed)).to(betas)
+        return root, betas
+
+    @cached_property
+    def _body_of(self) -> dict[int, BodyModel]:
+        """The body of each gender's code."""
+        return {GENDERS[body.gender]: body for body in self.bodies}
 
     def _camera_of(self, key: SampleKey) -> Camera:
         """The camera of a sample."""
@@ -264,9 +295,12 @@ class DepthSynthesizer:
         ]
 
     def _with_noise(self, keys: Sequence[SampleKey], scene: Scene) -> Scene:
-        """The scene, depth noise added to its images in place."""
-        for image, key in zip(scene.depth, keys):
-            add_depth_noise(image, self.settings.depth_noise_m, self._rng(key, _DEPTH_NOISE), in_place=True)
+        """The scene, its images as the sensor takes them; in place."""
+        for i, (image, key) in enumerate(zip(scene.depth, keys)):
+            if self.sensor is None:
+                add_depth_noise(image, self.settings.depth_noise_m, self._rng(key, _DEPTH_NOISE), in_place=True)
+            else:
+                self.sensor.expose(image, scene.cameras[i], scene.joints[i].numpy(), self._seed(key, _SENSOR))
         return scene
 
     def _observe(self, keys: Sequence[SampleKey], scene: Scene) -> Batch:

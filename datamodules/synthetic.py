@@ -25,6 +25,7 @@ from datamodules.batches import (
 )
 from datamodules.cache import cached_records, cached_samples
 from datamodules.placement import check_margin
+from datamodules.sensor import Sensor
 from datamodules.sources import PoseRecords, PoseSource
 from datamodules.synthesis import SAMPLES_VERSION, DepthSynthesizer, SampleKey, SynthesisSettings, concatenate
 from ljn.body import BodyModel, load_body_models
@@ -72,6 +73,8 @@ class SyntheticDepthDataModule(DataModule):
             used again 12 batches later, so an epoch of 12 batches uses none twice. Renders are kept by the workers,
             some 0.2 MB each: with 1, 2, 3, 4, 6 or 12 workers none is made twice; other numbers give the same
             samples, but make some anew.
+        sensor: What becomes of bodies and images before they are observed; None for `gaussian`, the thesis's noise. See
+            `datamodules.sensor`.
         num_workers: Worker processes; 0 renders in the main process.
         prefetch_batches: Batches that each worker keeps ready.
     """
@@ -94,6 +97,7 @@ class SyntheticDepthDataModule(DataModule):
         detector_ckpt: str | Path | None = None,
         redraw_each_epoch: bool = True,
         reuse: int | None = None,
+        sensor: Sensor | None = None,
         num_workers: int = 1,
         prefetch_batches: int = 4,
     ) -> None:
@@ -112,6 +116,7 @@ class SyntheticDepthDataModule(DataModule):
         self.reuse = 1 if reuse is None else reuse
         if not isinstance(self.reuse, int) or self.reuse < 1:
             raise ValueError(f"reuse: expected a whole number of 1 or more, got {reuse!r}")
+        self.sensor = sensor
         self.batch_size = batch_size
         self.seed = seed
         self.pool_seed = pool_seed
@@ -272,6 +277,7 @@ class SyntheticDepthDataModule(DataModule):
             (self.seed if is_train else self.eval_seed, SPLITS.index(split)),
             torch.float32 if is_train else torch.float64,
             -(-BLOCK // max(1, self.num_workers)) if is_train and self.reuse > 1 else 0,
+            self.sensor,
         )
 
     def train_dataloader(self) -> DataLoader:
@@ -317,6 +323,8 @@ class SyntheticDepthDataModule(DataModule):
         """Hash of everything that a fixed set depends on; a detector works on it afterwards."""
         seeds = f"{self.pool_seed} {self.eval_seed}"
         settings = f"{self.camera} {self.synthesis} {self.observation} {sorted(self._observed)}"
+        if self.sensor is not None:
+            settings += f" {self.sensor}"
         made_of = f"{self._samples_fingerprint} {split} {self.sizes[split]} {seeds} {settings}"
         return f"{split}-{hashlib.sha256(made_of.encode()).hexdigest()[:16]}"
 

@@ -84,7 +84,7 @@ KEYS: dict[str, Key] = {
     **_rows(
         "data", _DATA, "_target_ _convert_ num_train num_val num_test batch_size seed pool_seed eval_seed"
     ),
-    **_rows("data", _DATA, "camera redraw_each_epoch reuse synthesis observation"),
+    **_rows("data", _DATA, "camera redraw_each_epoch reuse sensor synthesis observation"),
     **_rows("data.synthesis", _DATA, "_target_ _convert_ heading distance_m margin_px depth_noise_m"),
     **_rows(
         "data.synthesis", _DATA, "keypoint_noise_px missing_keypoints focal_factors pixel_factors renderer"

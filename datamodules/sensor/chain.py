@@ -1,0 +1,167 @@
+"""The chain: which steps a sample goes through, how strongly, and with which draws."""
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, fields
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+
+from ljn.body import BodyModel
+from ljn.cloud.observation import body_box
+from ljn.geometry.camera import Camera
+
+_BORDER_PX = 12
+"""Room around the body that steps see, for what is added to it."""
+_LEAST_LEFT = 0.15
+"""Of a body's pixels; where a chain leaves fewer, the image stays as it was."""
+_FEWEST_LEFT = 40
+
+
+class Shot(NamedTuple):
+    """A depth image as it is taken: the part of it around the body.
+
+    Attributes:
+        depth: `(H, W)` float32, metres, 0 where nothing is measured, or nothing of the person; changed in place.
+        intrinsics: `(4,)` float64: fx, fy, cx, cy in the pixels of this part.
+        joints: `(24, 3)`, true joints, metres, camera frame.
+    """
+
+    depth: np.ndarray
+    intrinsics: np.ndarray
+    joints: np.ndarray
+
+
+@dataclass(frozen=True, kw_only=True)
+class Step:
+    """Base of the steps. A subclass does one thing, in the one of these methods that it overrides.
+
+    Attributes:
+        share: Share of the samples that go through it; 0 switches it off.
+    """
+
+    share: float = 1.0
+
+    def __post_init__(self) -> None:
+        name = type(self).__name__
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, list | tuple):
+                value = tuple(map(float, value))
+                object.__setattr__(self, field.name, value)
+            numbers = value if isinstance(value, tuple) else (value,)
+            if not all(isinstance(number, int | float) and math.isfinite(number) for number in numbers):
+                raise ValueError(f"{name}.{field.name}: expected a number or numbers, got {value!r}")
+        if not 0 <= self.share <= 1:
+            raise ValueError(f"{name}.share: expected a share between 0 and 1, got {self.share}")
+
+    def turn(self, rng: np.random.Generator, strength: float) -> np.ndarray | None:
+        """A rotation `(3, 3)` of the body in the body world, about the camera; None for none."""
+        return None
+
+    def shape(self, betas: np.ndarray, rng: np.random.Generator, strength: float) -> np.ndarray:
+        """Other shape coefficients `(10,)`."""
+        return betas
+
+    def dress(
+        self, vertices: np.ndarray, body: BodyModel, rng: np.random.Generator, strength: float
+    ) -> None:
+        """Change the surface `(V, 3)`, metres, in place; joints stay."""
+
+    def expose(self, shot: Shot, rng: np.random.Generator, strength: float) -> None:
+        """Change the image, in place."""
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """A chain of steps, in their order.
+
+    Each sample and step has draws of its own, which no other step's settings change.
+
+    Attributes:
+        steps: The steps by name.
+        strength: Of all steps: their sizes are multiplied by it; 0 leaves everything as it is.
+        varies: Whether each step of each sample has a strength of its own, uniform from 0 to `strength`.
+    """
+
+    steps: Mapping[str, Step]
+    strength: float = 1.0
+    varies: bool = False
+
+    def __post_init__(self) -> None:
+        if not (isinstance(self.strength, int | float) and 0 <= self.strength < math.inf):
+            raise ValueError(f"sensor.strength: expected a number of 0 or more, got {self.strength!r}")
+        for name, step in self.steps.items():
+            if not isinstance(step, Step):
+                raise ValueError(
+                    f"sensor.steps.{name}: expected a step of datamodules.sensor, got {type(step).__name__}"
+                )
+
+    def turn(self, key: list[int]) -> np.ndarray | None:
+        """A rotation `(3, 3)` of the body in the body world; `key` is what the draws depend on."""
+        turned: np.ndarray | None = None
+        for step, rng, strength in self._drawn(key, "turn"):
+            rotation = step.turn(rng, strength)
+            if rotation is not None:
+                turned = rotation if turned is None else rotation @ turned
+        return turned
+
+    def shape(self, betas: np.ndarray, key: list[int]) -> np.ndarray:
+        """Shape coefficients `(10,)` in place of others; `key` is what the draws depend on."""
+        for step, rng, strength in self._drawn(key, "shape"):
+            betas = step.shape(betas, rng, strength)
+        return betas
+
+    def dress(self, vertices: np.ndarray, body: BodyModel, key: list[int]) -> None:
+        """Change a surface `(V, 3)`, metres, in place; `key` is what the draws depend on."""
+        for step, rng, strength in self._drawn(key, "dress"):
+            step.dress(vertices, body, rng, strength)
+
+    def expose(self, depth: np.ndarray, camera: Camera, joints: np.ndarray, key: list[int]) -> None:
+        """Take a depth image `(H, W)` float32, metres, in place.
+
+        Where less than a seventh of the body would be left, or hardly a pixel, the image stays as it was.
+
+        Args:
+            depth: Of the body alone; 0 elsewhere.
+            camera: The camera.
+            joints: `(24, 3)`, metres, camera frame.
+            key: What the draws depend on.
+        """
+        left, right, top, bottom = body_box(depth)
+        if right < left:
+            return
+        left, top = max(0, left - _BORDER_PX), max(0, top - _BORDER_PX)
+        part = depth[top : bottom + 1 + _BORDER_PX, left : right + 1 + _BORDER_PX]
+        shot = Shot(
+            part, np.array([camera.fx, camera.fy, camera.cx - left, camera.cy - top]), np.asarray(joints)
+        )
+        before = part.copy()
+        for step, rng, strength in self._drawn(key, "expose"):
+            step.expose(shot, rng, strength)
+        if np.count_nonzero(part) < max(_FEWEST_LEFT, _LEAST_LEFT * np.count_nonzero(before)):
+            part[:] = before
+
+    def _drawn(self, key: list[int], method: str) -> Iterator[tuple[Step, np.random.Generator, float]]:
+        """The steps that a sample goes through which override `method`, each with its generator and strength."""
+        chosen = self._overriding[method]
+        if not chosen:
+            return
+        seeds = np.random.default_rng(key).integers(2**62, size=(len(self.steps), 3))
+        for place, step in chosen:
+            switch, strength = seeds[place, :2] / 2**62
+            if switch < step.share and self.strength > 0:
+                rng = np.random.Generator(np.random.PCG64(int(seeds[place, 2])))
+                yield step, rng, self.strength * (strength if self.varies else 1.0)
+
+    @cached_property
+    def _overriding(self) -> dict[str, list[tuple[int, Step]]]:
+        return {
+            method: [
+                (place, step)
+                for place, step in enumerate(self.steps.values())
+                if getattr(type(step), method) is not getattr(Step, method)
+            ]
+            for method in ("turn", "shape", "dress", "expose")
+        }
