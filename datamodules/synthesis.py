@@ -298,7 +298,9 @@ class DepthSynthesizer:
         """The scene, its images as the sensor takes them; in place."""
         for i, (image, key) in enumerate(zip(scene.depth, keys)):
             if self.sensor is None:
-                add_depth_noise(image, self.settings.depth_noise_m, self._rng(key, _DEPTH_NOISE), in_place=True)
+                add_depth_noise(
+                    image, self.settings.depth_noise_m, self._rng(key, _DEPTH_NOISE), in_place=True
+                )
             else:
                 self.sensor.expose(image, scene.cameras[i], scene.joints[i].numpy(), self._seed(key, _SENSOR))
         return scene

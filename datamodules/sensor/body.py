@@ -28,11 +28,12 @@ class Tilt(Step):
     roll_deg: float = 4
 
     def turn(self, rng: np.random.Generator, strength: float) -> np.ndarray:
-        pitch, roll = np.radians(strength * np.array([self.pitch_deg, self.roll_deg]) * rng.standard_normal(2))
-        # The body world's x points at the camera, its z up, and y across.
-        about_y = np.array(
-            [[np.cos(pitch), 0, np.sin(pitch)], [0, 1, 0], [-np.sin(pitch), 0, np.cos(pitch)]]
+        """See `Step`."""
+        pitch, roll = np.radians(
+            strength * np.array([self.pitch_deg, self.roll_deg]) * rng.standard_normal(2)
         )
+        # The body world's x points at the camera, its z up, and y across.
+        about_y = np.array([[np.cos(pitch), 0, np.sin(pitch)], [0, 1, 0], [-np.sin(pitch), 0, np.cos(pitch)]])
         about_x = np.array([[1, 0, 0], [0, np.cos(roll), -np.sin(roll)], [0, np.sin(roll), np.cos(roll)]])
         return about_x @ about_y
 
@@ -48,6 +49,7 @@ class WideShapes(Step):
     factor: float = 0.5
 
     def shape(self, betas: np.ndarray, rng: np.random.Generator, strength: float) -> np.ndarray:
+        """See `Step`."""
         return np.clip(betas * (1 + strength * self.factor), -4, 4)
 
 
@@ -71,9 +73,8 @@ class Clothing(Step):
     shoes_m: float = 0.02
     folds: float = 0.6
 
-    def dress(
-        self, vertices: np.ndarray, body: BodyModel, rng: np.random.Generator, strength: float
-    ) -> None:
+    def dress(self, vertices: np.ndarray, body: BodyModel, rng: np.random.Generator, strength: float) -> None:
+        """See `Step`."""
         wardrobe = _wardrobe(body)
         trunk, sleeves, legs, hair, shoes, collar = rng.random(6)
         sleeve_length, leg_length = rng.integers(0, 3, 2)

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from datamodules.sensor import kernels
 from ljn.body import BodyModel
 from ljn.cloud.observation import body_box
 from ljn.geometry.camera import Camera
@@ -24,11 +25,13 @@ class Shot(NamedTuple):
 
     Attributes:
         depth: `(H, W)` float32, metres, 0 where nothing is measured, or nothing of the person; changed in place.
+        spans: `(H, 2)` int64; see `datamodules.sensor.kernels`.
         intrinsics: `(4,)` float64: fx, fy, cx, cy in the pixels of this part.
         joints: `(24, 3)`, true joints, metres, camera frame.
     """
 
     depth: np.ndarray
+    spans: np.ndarray
     intrinsics: np.ndarray
     joints: np.ndarray
 
@@ -64,9 +67,7 @@ class Step:
         """Other shape coefficients `(10,)`."""
         return betas
 
-    def dress(
-        self, vertices: np.ndarray, body: BodyModel, rng: np.random.Generator, strength: float
-    ) -> None:
+    def dress(self, vertices: np.ndarray, body: BodyModel, rng: np.random.Generator, strength: float) -> None:
         """Change the surface `(V, 3)`, metres, in place; joints stay."""
 
     def expose(self, shot: Shot, rng: np.random.Generator, strength: float) -> None:
@@ -132,16 +133,21 @@ class Sensor:
         left, right, top, bottom = body_box(depth)
         if right < left:
             return
-        left, top = max(0, left - _BORDER_PX), max(0, top - _BORDER_PX)
-        part = depth[top : bottom + 1 + _BORDER_PX, left : right + 1 + _BORDER_PX]
-        shot = Shot(
-            part, np.array([camera.fx, camera.fy, camera.cx - left, camera.cy - top]), np.asarray(joints)
-        )
-        before = part.copy()
+        # With a border all around, even beyond the image, where it is forgotten again.
+        body = depth[top : bottom + 1, left : right + 1]
+        part = np.zeros((body.shape[0] + 2 * _BORDER_PX, body.shape[1] + 2 * _BORDER_PX), np.float32)
+        part[_BORDER_PX:-_BORDER_PX, _BORDER_PX:-_BORDER_PX] = body
+        spans = np.empty((len(part), 2), np.int64)
+        number = kernels.row_spans(part, spans)
+        left, top = left - _BORDER_PX, top - _BORDER_PX
+        intrinsics = np.array([camera.fx, camera.fy, camera.cx - left, camera.cy - top])
+        shot = Shot(part, spans, intrinsics, np.asarray(joints))
         for step, rng, strength in self._drawn(key, "expose"):
             step.expose(shot, rng, strength)
-        if np.count_nonzero(part) < max(_FEWEST_LEFT, _LEAST_LEFT * np.count_nonzero(before)):
-            part[:] = before
+        if kernels.row_spans(part, spans) >= max(_FEWEST_LEFT, _LEAST_LEFT * number):
+            u, v = max(0, left), max(0, top)
+            image = depth[v : top + len(part), u : left + part.shape[1]]
+            image[:] = part[v - top :, u - left :][: image.shape[0], : image.shape[1]]
 
     def _drawn(self, key: list[int], method: str) -> Iterator[tuple[Step, np.random.Generator, float]]:
         """The steps that a sample goes through which override `method`, each with its generator and strength."""

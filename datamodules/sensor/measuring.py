@@ -8,9 +8,6 @@ import numpy as np
 from datamodules.sensor import kernels
 from datamodules.sensor.chain import Shot, Step
 
-_STEEPEST = math.radians(80)
-"""The largest angle that the noise models count; they were measured up to 60 or 70 degrees."""
-
 
 def seed_of(rng: np.random.Generator) -> np.uint64:
     """A seed for the kernels."""
@@ -29,25 +26,29 @@ class AxialNoise(Step):
       z^-0.5 theta^2 / (pi / 2 - theta)^2.
 
     Attributes:
-        terms: c0, c1, c2, c3 and p.
+        terms: c0, c1, c2, c3 and p, a multiple of a half.
     """
 
     terms: tuple[float, ...] = (0.0015, -0.0005, 0.0003, 0.0001, 1.5)
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if len(self.terms) != 5:
-            raise ValueError(f"AxialNoise.terms: expected 5 numbers, c0 to c3 and p, got {len(self.terms)}")
+        if len(self.terms) != 5 or 2 * self.terms[4] % 1:
+            raise ValueError(
+                f"AxialNoise.terms: expected 5 numbers, c0 to c3 and p, a multiple of 0.5, got {self.terms}"
+            )
 
     def sigma_m(self, z: np.ndarray, theta: np.ndarray) -> np.ndarray:
         """The standard deviation at depths, metres, and angles, radians."""
         c0, c1, c2, c3, power = self.terms
-        theta = np.minimum(theta, _STEEPEST)
+        theta = np.minimum(theta, kernels.STEEPEST)
         return c0 + c1 * z + c2 * z**2 + c3 * z**power * theta**2 / (np.pi / 2 - theta) ** 2
 
     def expose(self, shot: Shot, rng: np.random.Generator, strength: float) -> None:
-        terms = np.array([*self.terms, _STEEPEST])
-        kernels.axial_noise(shot.depth, *shot.intrinsics[:2], terms, strength, seed_of(rng))
+        """See `Step`."""
+        fx, fy, *_ = shot.intrinsics
+        terms, halves = np.array(self.terms[:4]), int(2 * self.terms[4])
+        kernels.axial_noise(shot.depth, shot.spans, fx, fy, terms, halves, strength, seed_of(rng))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,7 +62,8 @@ class Lateral(Step):
     sigma_px: float = 0.6
 
     def expose(self, shot: Shot, rng: np.random.Generator, strength: float) -> None:
-        kernels.lateral(shot.depth, strength * self.sigma_px, seed_of(rng))
+        """See `Step`."""
+        kernels.lateral(shot.depth, shot.spans, strength * self.sigma_px, seed_of(rng))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,8 +81,11 @@ class FlyingPixels(Step):
     behind_m: tuple[float, float] = (0.1, 1.0)
 
     def expose(self, shot: Shot, rng: np.random.Generator, strength: float) -> None:
+        """See `Step`."""
         rate = min(1.0, strength * self.rate)
-        kernels.flying_pixels(shot.depth, self.jump_m, rate, rng.uniform(*self.behind_m), seed_of(rng))
+        kernels.flying_pixels(
+            shot.depth, shot.spans, self.jump_m, rate, rng.uniform(*self.behind_m), seed_of(rng)
+        )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,9 +101,11 @@ class Grazing(Step):
     rate: float = 0.7
 
     def expose(self, shot: Shot, rng: np.random.Generator, strength: float) -> None:
+        """See `Step`."""
+        fx, fy, *_ = shot.intrinsics
         tangent = math.tan(math.radians(self.angle_deg))
         rate = min(1.0, strength * self.rate)
-        kernels.grazing(shot.depth, *shot.intrinsics[:2], tangent, rate, seed_of(rng))
+        kernels.grazing(shot.depth, shot.spans, fx, fy, tangent, rate, seed_of(rng))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -114,17 +121,17 @@ class Multipath(Step):
     scale: float = 0.003
 
     def expose(self, shot: Shot, rng: np.random.Generator, strength: float) -> None:
+        """See `Step`."""
         grid = strength * self.most_m * rng.random((5, 5)) * rng.random()
-        shot.depth[:] *= np.float32(1 + strength * self.scale * rng.standard_normal())
-        kernels.smooth_bias(shot.depth, grid)
+        scale = 1 + strength * self.scale * rng.standard_normal()
+        kernels.smooth_bias(shot.depth, shot.spans, scale, grid)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Disparity(Step):
     """Depth in steps, as structured light and stereo measure it: disparity f b / z is read in steps.
 
-    A Kinect v1 or Xtion (580 px at 640 pixels, 75 mm, steps of 1/8 px) has steps of 26 mm at 3 m; a RealSense D435 (50 mm,
-    1/32 px, but noisier) of less.
+    A Kinect v1 or Xtion (580 px at 640 pixels, 75 mm, steps of 1/8 px) has steps of 26 mm at 3 m.
 
     Attributes:
         focal_baseline: Range of f b, pixels times metres; uniform in its logarithm.
@@ -137,11 +144,12 @@ class Disparity(Step):
     noise_px: float = 0.05
 
     def expose(self, shot: Shot, rng: np.random.Generator, strength: float) -> None:
+        """See `Step`."""
         low, high = self.focal_baseline
         focal_baseline = math.exp(rng.uniform(math.log(low), math.log(high)))
         if strength > 0:
             kernels.disparity(
-                shot.depth, focal_baseline / strength, self.step_px, self.noise_px, seed_of(rng)
+                shot.depth, shot.spans, focal_baseline / strength, self.step_px, self.noise_px, seed_of(rng)
             )
 
 
@@ -156,8 +164,9 @@ class Shadow(Step):
     baseline_m: float = 0.075
 
     def expose(self, shot: Shot, rng: np.random.Generator, strength: float) -> None:
-        depth = shot.depth if rng.random() < 0.5 else shot.depth[:, ::-1]
-        kernels.shadow(depth, strength * self.baseline_m * shot.intrinsics[0], 0.75)
+        """See `Step`."""
+        is_right = bool(rng.random() < 0.5)
+        kernels.shadow(shot.depth, shot.spans, strength * self.baseline_m * shot.intrinsics[0], is_right)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -173,12 +182,13 @@ class Holes(Step):
     size: tuple[float, float] = (0.01, 0.05)
 
     def expose(self, shot: Shot, rng: np.random.Generator, strength: float) -> None:
+        """See `Step`."""
         height, width = shot.depth.shape
         for _ in range(rng.integers(0, int(self.most) + 1)):
             u, v = rng.random(2) * (width, height)
             half_u, half_v = strength * max(width, height) * rng.uniform(*self.size, 2)
             kernels.clear_shape(
-                shot.depth, u, v, max(half_u, 0.5), max(half_v, 0.5), rng.uniform(0, np.pi), 2.0
+                shot.depth, u, v, max(half_u, 0.5), max(half_v, 0.5), rng.uniform(0, np.pi), False
             )
 
 
@@ -195,4 +205,5 @@ class Range(Step):
     far_m: float = 4.5
 
     def expose(self, shot: Shot, rng: np.random.Generator, strength: float) -> None:
-        kernels.clip_range(shot.depth, self.near_m, self.far_m)
+        """See `Step`."""
+        kernels.clip_range(shot.depth, shot.spans, self.near_m, self.far_m)

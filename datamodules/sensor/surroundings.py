@@ -34,19 +34,18 @@ class Occluder(Step):
     cover: tuple[float, float] = (0.03, 0.25)
 
     def expose(self, shot: Shot, rng: np.random.Generator, strength: float) -> None:
+        """See `Step`."""
         height, width = shot.depth.shape
         area = strength * rng.uniform(*self.cover) * height * width
         aspect = math.exp(rng.uniform(-1.2, 1.2))
         half_u, half_v = math.sqrt(area * aspect) / 2, math.sqrt(area / aspect) / 2
         u, v = rng.random(2) * (width, height)
-        is_box = rng.random() < 0.5
+        is_box = bool(rng.random() < 0.5)
         if is_box and rng.random() < 0.5:  # a table: everything from a height down, on one side
             u, v = rng.choice([0, width]), height
             half_u, half_v = 2 * half_u, 2 * half_v
         angle = 0.1 * rng.standard_normal() if is_box else rng.uniform(0, math.pi)
-        kernels.clear_shape(
-            shot.depth, u, v, max(half_u, 0.5), max(half_v, 0.5), angle, 8.0 if is_box else 2.0
-        )
+        kernels.clear_shape(shot.depth, u, v, max(half_u, 0.5), max(half_v, 0.5), angle, is_box)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,6 +59,7 @@ class HeldObject(Step):
     size_m: tuple[float, float] = (0.03, 0.18)
 
     def expose(self, shot: Shot, rng: np.random.Generator, strength: float) -> None:
+        """See `Step`."""
         hand = shot.joints[rng.choice(_HANDS)] + 0.03 * rng.standard_normal(3)
         if hand[2] < _SHORTEST_Z:
             return
@@ -68,8 +68,8 @@ class HeldObject(Step):
         half_u, half_v = strength * px * rng.uniform(*self.size_m, 2)
         slopes = rng.uniform(-1, 1, 2) / px
         kernels.add_object(
-            *(shot.depth, u, v, max(half_u, 0.5), max(half_v, 0.5), rng.uniform(0, math.pi)),
-            *(rng.choice([2.0, 8.0]), hand[2], rng.uniform(0.01, 0.08), *slopes),
+            *(shot.depth, shot.spans, u, v, max(half_u, 0.5), max(half_v, 0.5), rng.uniform(0, math.pi)),
+            *(bool(rng.random() < 0.5), hand[2], rng.uniform(0.01, 0.08), *slopes),
         )
 
 
@@ -84,6 +84,7 @@ class Floor(Step):
     reach_m: tuple[float, float] = (0.05, 0.25)
 
     def expose(self, shot: Shot, rng: np.random.Generator, strength: float) -> None:
+        """See `Step`."""
         lean = 0.25 * rng.standard_normal()
         normal = np.array([0.0, math.cos(lean), math.sin(lean)])
         lowest = max((shot.joints[foot] for foot in _FEET), key=lambda foot: float(foot @ normal))
@@ -95,7 +96,9 @@ class Floor(Step):
             joint = shot.joints[foot]
             if joint[2] >= _SHORTEST_Z and abs(float(joint @ normal) - offset) < 0.12:
                 u, v = _pixel(shot, joint)
-                kernels.add_plane(shot.depth, shot.intrinsics, normal, offset, u, v, reach, joint[2], 0.4)
+                kernels.add_plane(
+                    shot.depth, shot.spans, shot.intrinsics, normal, offset, u, v, reach, joint[2], 0.4
+                )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -109,6 +112,7 @@ class CutOff(Step):
     most: float = 0.3
 
     def expose(self, shot: Shot, rng: np.random.Generator, strength: float) -> None:
+        """See `Step`."""
         height, width = shot.depth.shape
         part = strength * self.most * rng.random()
         rows, columns = round(part * height), round(part * width)
@@ -134,6 +138,7 @@ class LostLimb(Step):
     radius_m: tuple[float, float] = (0.08, 0.2)
 
     def expose(self, shot: Shot, rng: np.random.Generator, strength: float) -> None:
+        """See `Step`."""
         x, y, z = map(float, shot.joints[rng.choice(_ENDS)])
         if z >= _SHORTEST_Z:
             kernels.lose_ball(shot.depth, shot.intrinsics, x, y, z, strength * rng.uniform(*self.radius_m))
@@ -154,10 +159,13 @@ class MaskErrors(Step):
     behind_m: tuple[float, float] = (0.05, 2.0)
 
     def expose(self, shot: Shot, rng: np.random.Generator, strength: float) -> None:
+        """See `Step`."""
         is_loss = rng.random() < 0.6
         for _ in range(rng.integers(1, 3)):
             if is_loss:
-                kernels.lose_border(shot.depth, strength * self.lose * rng.random(), seed_of(rng))
+                kernels.lose_border(shot.depth, shot.spans, strength * self.lose * rng.random(), seed_of(rng))
             else:
                 behind = rng.uniform(*self.behind_m)
-                kernels.gain_border(shot.depth, strength * self.gain * rng.random(), behind, seed_of(rng))
+                kernels.gain_border(
+                    shot.depth, shot.spans, strength * self.gain * rng.random(), behind, seed_of(rng)
+                )

@@ -224,10 +224,20 @@ def body_box(depth: np.ndarray) -> tuple[int, int, int, int]:
     height, width = depth.shape
     left, right, top, bottom = width, -1, height, -1
     for v in range(height):
-        for u in range(width):
+        is_empty = True
+        for u in range(width):  # without a jump, some pixels at once
+            is_empty &= not depth[v, u] > 0
+        if is_empty:
+            continue
+        top, bottom = min(top, v), v
+        for u in range(left):
             if depth[v, u] > 0:
-                left, right = min(left, u), max(right, u)
-                top, bottom = min(top, v), max(bottom, v)
+                left = u
+                break
+        for u in range(width - 1, right, -1):
+            if depth[v, u] > 0:
+                right = u
+                break
     return left, right, top, bottom
 
 
