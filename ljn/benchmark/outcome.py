@@ -33,7 +33,7 @@ class Section:
     title: str
     sheet: Sheet
     charts: Sequence[str] = ()
-    notes: Sequence[str] = ()
+    notes: list[str] = field(default_factory=list)
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ def write_outcome(directory: Path, outcome: Outcome, command: str) -> str:
     write_text_atomically(directory / SAMPLES, _csv(outcome.samples))
     write_text_atomically(directory / layout.TABLE_MARKDOWN, _markdown(outcome))
     write_text_atomically(directory / PAGE, _html(outcome, command))
-    blocks = []
+    blocks = ["\n".join(f"{name}: {value}" for name, value in outcome.facts.items())]
     for section in outcome.sections:
         notes = [f"  {note}" for note in section.notes]
         blocks.append("\n".join([section.title, *text_lines(section.sheet), *notes]))

@@ -5,6 +5,7 @@ A predictor is an object with a `name` that is called with frames. What it may s
 - `reads`: which of `keypoints`, `joints` and `points` of a frame (see `BenchFrame`) it reads; none by default. Axes of
   what is not read are left out.
 - `needs_keypoints`: whether it cannot do without keypoints; False by default.
+- `is_on_surface`: whether its joints are points of the body's surface, not SMPL's joints; False by default.
 - `fingerprint`: text that changes with its results; by default the hash of its configuration and its class's file.
 """
 
@@ -148,6 +149,7 @@ class LiftedKeypoints:
     name = "lifted keypoints"
     reads = ("keypoints",)
     needs_keypoints = True
+    is_on_surface = True
     fingerprint = "lifted keypoints 1"
 
     def __call__(self, frames: Sequence[BenchFrame]) -> np.ndarray:
@@ -189,6 +191,7 @@ class Entrant:
     reads: frozenset[str]
     needs_keypoints: bool
     fingerprint: str
+    is_on_surface: bool = False
 
     def skips(self, reads: str, has_keypoints: bool) -> str:
         """Why a condition is not measured: a few words; "" where it is.
@@ -291,4 +294,5 @@ def entrant(predictor: Any, key: str, config: Mapping[str, Any]) -> Entrant:
         made_of = json.dumps(config, sort_keys=True, default=str).encode()
         fingerprint = hashlib.sha256(made_of + content).hexdigest()[:16]
     needs_keypoints = bool(getattr(predictor, "needs_keypoints", False))
-    return Entrant(name, predictor, reads, needs_keypoints, str(fingerprint))
+    is_on_surface = bool(getattr(predictor, "is_on_surface", False))
+    return Entrant(name, predictor, reads, needs_keypoints, str(fingerprint), is_on_surface)

@@ -124,7 +124,10 @@ class RenderedBenchmark:
         sections = [_base_section(bases, len(self.samples))]
         for axis in self.axes:
             of_axis = [each for each in measured if each.step.axis is axis]
-            sections.append(_axis_section(axis, of_axis, entrants, num_axis))
+            if any(each.errors is not None or each.status == _FAILED for each in of_axis):
+                sections.append(_axis_section(axis, of_axis, num_axis))
+            else:
+                sections[0].notes.append(f"Axis left out, which no predictor reads: {axis.label}.")
         sections += [_group_section(name, label, bases, of_group) for name, label, of_group in groups]
         sections.append(_details_section(bases))
         metrics = {
@@ -279,6 +282,8 @@ def _sheet_of_columns(bases: Sequence[Measured], keys: Sequence[str]) -> Sheet:
     labels = {column.key: column.label for column in COLUMNS}
     rows = []
     for each in bases:
+        if each.errors is None and each.status != _FAILED:
+            continue  # what it cannot do, or does not read
         row = _row(each)
         label = f"{each.entrant.name}, {_BASES[each.step.with_keypoints]}"
         rows.append([Entry(label), *(_cell(row, key) for key in keys)])
@@ -361,7 +366,7 @@ def _charts(lines: Sequence[_Line], values: Sequence[Any], label: str) -> list[s
     return charts
 
 
-def _axis_section(axis: Axis, measured: Sequence[Measured], entrants: Sequence[Entrant], num: int) -> Section:
+def _axis_section(axis: Axis, measured: Sequence[Measured], num: int) -> Section:
     lines = _lines([_row(each) for each in measured])
     if axis.is_of_mesh and any(line.key == "pve_mean" for line in lines):
         lines = [line for line in lines if line.key == "pve_mean" or not _has(line.rows, "pve_mean")]
