@@ -95,7 +95,7 @@ class BenchSamples:
     @property
     def sensors(self) -> Sequence[str]:
         """See `ljn.benchmark.frames.BenchSamples`."""
-        return ()  # SENSORS: their names, once sensors are given
+        return ()  # SENSORS: their names, once the constructor takes them; `first` is to pass them on
 
     def __len__(self) -> int:
         return len(self.definition)

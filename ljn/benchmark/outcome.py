@@ -61,13 +61,13 @@ class Outcome:
     metrics: Mapping[str, float] = field(default_factory=dict)
 
 
-def entry(value: Any, style: str = "ours") -> Entry:
+def entry(value: Any) -> Entry:
     """A cell: a number with one decimal, a dash for none, or words."""
     if value is None:
         return Entry(NONE, "none")
     if isinstance(value, str):
         return Entry(value, "none")
-    return Entry(number(value) if isinstance(value, float) else str(value), style)
+    return Entry(number(value) if isinstance(value, float) else str(value))
 
 
 def write_outcome(directory: Path, outcome: Outcome, command: str) -> str:

@@ -1,29 +1,18 @@
 import csv
+import re
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from datamodules.bench import BenchSamples
+from ljn.benchmark.labels import joint_map
 from ljn.tasks.benchmark import benchmark
 
 SMALL = ("task=benchmark", "bench.num_samples=8", "bench.num_axis=4")
-FOREIGN = """
-import numpy as np
-
-
-class CloudMean:
-    def __init__(self, height_m=0.0):
-        self.height_m = height_m
-
-    def __call__(self, frames):
-        made = []
-        for frame in frames:
-            v, u = np.nonzero(frame.depth)
-            z, camera = frame.depth[v, u], frame.camera
-            points = np.stack([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z], -1)
-            made.append(np.tile(points.mean(0) - [0, self.height_m, 0], (24, 1)))
-        return np.stack(made)
+DOCS = Path(__file__).parents[2] / "docs" / "benchmark.md"
+BROKEN = """
 
 
 class Broken(CloudMean):
@@ -42,8 +31,9 @@ def cache(tmp_path_factory):
 
 @pytest.fixture
 def foreign(tmp_path, monkeypatch):
-    """A user's own module, `foreign_predictors`."""
-    (tmp_path / "foreign_predictors.py").write_text(FOREIGN)
+    """A user's own module, `foreign_predictors`: the example of the docs, and one that is broken."""
+    [example] = re.findall(r"```python\n(.*?)```", DOCS.read_text(), re.DOTALL)
+    (tmp_path / "foreign_predictors.py").write_text(example + BROKEN)
     monkeypatch.syspath_prepend(tmp_path)
     yield
     sys.modules.pop("foreign_predictors", None)
@@ -156,8 +146,6 @@ def test_real_frames_with_the_preset_of_their_names(smoke_config, tmp_path, cach
     samples = BenchSamples(cache.partition("=")[2], num_samples=8)
     cfg = smoke_config(tmp_path, "task=benchmark", "bench=itop", cache, "bench.num_samples=8")
     names, camera = list(cfg.bench.joints), samples.camera(0)
-    from ljn.benchmark.labels import joint_map
-
     joints = joint_map(names, dict(cfg.bench.joints))(samples.truth([0, 0]).joints)
     path = tmp_path / "frames.npz"
     depth = np.stack([samples.clean_depth(0)] * 2)
