@@ -557,6 +557,8 @@ def test_a_steps_draws_are_its_own():
     assert 5 < is_marked.sum() < 25
     for values in found:
         assert np.array_equal(values[is_marked], found[-1][is_marked])
+    longer = Sensor({"other": Tilt(), "mark": Mark(share=0.5), "last": Tilt()}, varies=True)
+    assert np.array_equal(marks(longer, range(30)), found[-1], equal_nan=True)
     two = Sensor({"a": Mark(), "b": Mark()})
     assert (marks(two, range(9)) != marks(Sensor({"a": Mark(), "b": Mark(share=0)}), range(9))).all()
 
