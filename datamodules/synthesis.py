@@ -239,10 +239,6 @@ class DepthSynthesizer:
 
         gender = torch.from_numpy(self.records.gender[rows])
         vertices, joints = self._smpl(pose, betas, gender)
-        if self.sensor is not None and with_depth:
-            vertices = vertices.contiguous()
-            for mesh, key, row in zip(vertices.numpy(), keys, gender.tolist()):
-                self.sensor.dress(mesh, self._body_of[row], self._seed(key, _PERSON))
         vertices, joints = body_to_camera(vertices), body_to_camera(joints)
         transl = torch.from_numpy(
             np.stack(
@@ -254,6 +250,9 @@ class DepthSynthesizer:
         ).to(self.dtype)
         joints = joints + transl[:, None]
         if with_depth:
+            if self.sensor is not None:  # after the bodies have their places, which clothes do not change
+                for mesh, key, row in zip(vertices.numpy(), keys, gender.tolist()):
+                    self.sensor.dress(mesh, self._body_of[row], self._seed(key, _PERSON))
             depth = self._images(vertices + transl[:, None], cameras)
         else:
             depth = [np.zeros((0, 0), np.float32)] * len(keys)
