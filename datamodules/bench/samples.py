@@ -14,13 +14,15 @@ from torch import Tensor
 from datamodules.bench.definition import CHUNK, PATH, VERSION, Definition, Poser, read_definition
 from datamodules.cache import cached_samples
 from datamodules.noise import add_depth_noise, add_joint_noise, add_keypoint_noise
+from datamodules.sensor import Sensor
 from ljn.benchmark.conditions import REFERENCE_FOCAL_PX, Condition
 from ljn.benchmark.frames import BenchFrame, BenchTruth
+from ljn.body import GENDERS
 from ljn.body.skeleton import NUM_JOINTS
 from ljn.cloud.observation import body_box
 from ljn.geometry.camera import Camera, project
 from ljn.geometry.rotations import rotvec_to_rotmat
-from ljn.render import get_renderer
+from ljn.render import Renderer, get_renderer
 
 DEPTH_NOISE_M = 0.001
 """Standard deviation of the base condition's noise, metres."""
@@ -46,12 +48,22 @@ class BenchSamples:
         cache_dir: Where meshes, joints and clean depth images are kept once they are made, some 0.15 MB a sample.
         path: Another definition's file, of the same form; None: the benchmark that ships.
         num_samples: The first so many samples; None: all.
+        sensors: Sensors by name, as `data/sensor=NAME` configures them: a `Sensor`, or a mapping with one as `sensor`. Of
+            their steps, those that change the pose, the shape or the camera count for nothing here.
     """
 
     def __init__(
-        self, cache_dir: str | Path, path: str | Path | None = None, num_samples: int | None = None
+        self,
+        cache_dir: str | Path,
+        path: str | Path | None = None,
+        num_samples: int | None = None,
+        sensors: Mapping[str, Any] | None = None,
     ) -> None:
         self.cache_dir = Path(cache_dir)
+        self._sensors: dict[str, Sensor] = {
+            name: each if isinstance(each, Sensor) else each["sensor"]
+            for name, each in (sensors or {}).items()
+        }
         self.path = Path(path or PATH)
         self.num_samples = num_samples
         if num_samples is not None and (not isinstance(num_samples, int) or num_samples < 1):
@@ -95,19 +107,20 @@ class BenchSamples:
     @property
     def sensors(self) -> Sequence[str]:
         """See `ljn.benchmark.frames.BenchSamples`."""
-        return ()  # SENSORS: their names, once the constructor takes them; `first` is to pass them on
+        return tuple(self._sensors)
 
     def __len__(self) -> int:
         return len(self.definition)
 
     def first(self, num_samples: int) -> Self:
         """See `ljn.benchmark.frames.BenchSamples`."""
-        return type(self)(self.cache_dir, self.path, num_samples)
+        return type(self)(self.cache_dir, self.path, num_samples, self._sensors)
 
     def identity(self, condition: Condition) -> dict[str, Any]:
         """See `ljn.benchmark.frames.BenchSamples`."""
-        # SENSORS: of a condition with a sensor, the sensor's settings belong here, too.
         made_of = {"definition": self.definition.hash, "bodies": self._bodies, "form": _FORM}
+        if condition.sensor is not None:
+            made_of["sensor_settings"] = repr(self._sensors[condition.sensor])
         return {**made_of, **condition.changes}
 
     @cached_property
@@ -118,7 +131,7 @@ class BenchSamples:
 
     def _make(self) -> dict[str, Tensor]:
         """Meshes, joints, the body's box of each clean depth image, one after another; the depth images' hash."""
-        definition, renderer = self.definition, get_renderer("zbuffer")
+        definition, renderer = self.definition, self._renderer
         num_vertices = self._poser.layer.num_vertices
         vertices, joints = (torch.empty(len(self), size, 3) for size in (num_vertices, NUM_JOINTS))
         keypoints, centre = torch.empty(len(self), NUM_JOINTS, 2), torch.empty(len(self))
@@ -196,10 +209,19 @@ class BenchSamples:
         """A sample's depth image `(H, W)`, as the condition's sensor takes it."""
         if condition.sensor is None:
             return self._noisy(index, self.clean_depth(index))
-        # SENSORS: the one place where a sensor comes in. What it dresses is rendered here instead of `clean_depth`
-        # (`dress(vertices, betas, rng)`), and what it exposes is returned (`expose(depth, camera, joints, seed_key)`),
-        # with draws from (self.definition.seed[index], _SENSOR).
-        raise ValueError(f"sensor: expected one of {', '.join(self.sensors)}, got {condition.sensor!r}")
+        sensor, seed = self._sensors[condition.sensor], int(self.definition.seed[index])
+        mesh, camera = self._made["vertices"][index].numpy().astype(np.float64), self.camera(index)
+        [body] = [
+            body for body in self._poser.bodies if GENDERS[body.gender] == self.definition.gender[index]
+        ]
+        sensor.dress(mesh, body, [seed, _SENSOR, 0])
+        depth = self._renderer(torch.from_numpy(mesh)[None], self._poser.layer.faces, camera)[0].numpy()
+        sensor.expose(depth, camera, self._made["joints"][index].numpy(), [seed, _SENSOR, 1])
+        return depth
+
+    @cached_property
+    def _renderer(self) -> Renderer:
+        return get_renderer("zbuffer")
 
     def _keypoints(self, index: int, condition: Condition) -> np.ndarray | None:
         """`(24, 3)` float32, within the image as a detector's are."""
