@@ -48,8 +48,8 @@ class BenchSamples:
         cache_dir: Where meshes, joints and clean depth images are kept once they are made, some 0.15 MB a sample.
         path: Another definition's file, of the same form; None: the benchmark that ships.
         num_samples: The first so many samples; None: all.
-        sensors: Sensors by name, as `data/sensor=NAME` configures them: a `Sensor`, or a mapping with one as `sensor`. Of
-            their steps, those that change the pose, the shape or the camera count for nothing here.
+        sensors: Sensors by name, as `data/sensor=NAME` configures them: a `Sensor`, or a mapping with one as `sensor`.
+            Of their steps, those that change the pose, the shape or the camera count for nothing here.
     """
 
     def __init__(
