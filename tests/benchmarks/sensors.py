@@ -194,7 +194,7 @@ def shaded(depth: np.ndarray, focal: float) -> np.ndarray:
 
 
 def tile(depth: np.ndarray, focal: float) -> Image.Image:
-    """The body of a depth image in a tile: pixel by pixel, small ones enlarged, of large ones every second, or so on."""
+    """The body of a depth image in a tile: small ones enlarged, of large ones every second pixel, or so."""
     left, right, top, bottom = body_box(depth)
     part = depth[top : bottom + 1, left : right + 1]
     fit = min(TILE[0] / part.shape[0], TILE[1] / part.shape[1])
