@@ -209,6 +209,10 @@ class BenchSamples:
         """A sample's depth image `(H, W)`, as the condition's sensor takes it."""
         if condition.sensor is None:
             return self._noisy(index, self.clean_depth(index))
+        if condition.sensor not in self._sensors:
+            raise ValueError(
+                f"sensor: expected one of {', '.join(self.sensors) or 'none'}, got {condition.sensor!r}"
+            )
         sensor, seed = self._sensors[condition.sensor], int(self.definition.seed[index])
         mesh, camera = self._made["vertices"][index].numpy().astype(np.float64), self.camera(index)
         [body] = [

@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from datamodules.bench import BenchSamples
+from datamodules.sensor import AxialNoise, Clothing, Sensor
 from ljn.benchmark.conditions import AXES as ALL_AXES
 from ljn.benchmark.conditions import BASE, REFERENCE_FOCAL_PX, steps_of
 from ljn.geometry.camera import project
@@ -154,3 +155,24 @@ def test_an_identity_says_what_differs(samples):
 def test_a_sensor_that_there_is_not_is_refused(samples):
     with pytest.raises(ValueError, match="sensor: expected one of"):
         samples.frames([0], replace(BASE, sensor="lidar"))
+
+
+def test_a_sensor_dresses_and_exposes_the_same_body_each_time(samples):
+    sensors = {
+        "dressed": Sensor({"clothing": Clothing()}),
+        "noisy": {"sensor": Sensor({"axial": AxialNoise()}), "synthesis": {"pixel_factors": [0.3, 1]}},
+    }
+    seen = BenchSamples(samples.cache_dir, num_samples=NUM, sensors=sensors)
+    assert seen.sensors == ("dressed", "noisy")
+    assert seen.first(3).sensors == seen.sensors
+    conditions = [replace(BASE, sensor=name) for name in seen.sensors]
+    identities = [str(seen.identity(condition)) for condition in (BASE, *conditions)]
+    assert len(set(identities)) == 3
+    assert str(samples.identity(BASE)) == identities[0]
+    for condition in conditions:
+        [frame], again = seen.frames([5], condition), seen.frames(range(NUM), condition)[5]
+        np.testing.assert_array_equal(frame.depth, again.depth)
+    clean, (dressed, noisy) = samples.clean_depth(5), (seen.frames([5], each)[0].depth for each in conditions)
+    assert (dressed > 0).sum() > (clean > 0).sum()
+    assert ((noisy > 0) == (clean > 0)).all()
+    assert 0.0005 < np.std((noisy - clean)[clean > 0]) < 0.02
