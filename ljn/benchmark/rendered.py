@@ -1,31 +1,33 @@
 """The benchmark on rendered samples: the base condition, its groups, and one axis after another."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from ljn.benchmark.conditions import AXES, BASE, Axis, Condition, Step, sensor_axis, steps_of
+from ljn.benchmark.conditions import AXES, BASE, Condition, sensor_axis, steps_of
 from ljn.benchmark.frames import BenchSamples
-from ljn.benchmark.measures import COLUMNS, Errors, chosen, measure, summary
-from ljn.benchmark.outcome import Outcome, Section, entry
+from ljn.benchmark.measures import Errors, measure
+from ljn.benchmark.outcome import Outcome
 from ljn.benchmark.predictors import Entrant
+from ljn.benchmark.sections import (
+    BASE_AXIS,
+    BASES,
+    FAILED,
+    Measured,
+    axis_section,
+    base_section,
+    describe,
+    details_section,
+    group_rows,
+    group_section,
+    result_row,
+    sample_rows,
+)
 from ljn.benchmark.store import Store
-from ljn.report.charts import Series, line_chart
-from ljn.report.writers import Entry, Sheet
 
 BATCH = 40
-_BASES = {True: "10 px keypoints", False: "no keypoints"}
-_FAILED = "FAILED"
-
-
-class Measured(NamedTuple):
-    """What became of a predictor under a condition: errors, or why there are none."""
-
-    entrant: Entrant
-    step: Step
-    errors: Errors | None
-    status: str  # "" with errors
+_MEASURES_VERSION = 1
+"""Raised with every change of what is measured."""
 
 
 class RenderedBenchmark:
@@ -71,15 +73,15 @@ class RenderedBenchmark:
             tick: Called with a few words before each condition.
         """
         num_axis = min(self.num_axis, len(self.samples))
-        bases = steps_of(_BASE_AXIS)
+        bases = steps_of(BASE_AXIS)
         steps = [step for axis in self.axes for step in steps_of(axis)]
         measured: list[Measured] = []
         failures: list[str] = []
         for entrant in entrants:
             has_failed = False
             for step in [*bases, *steps]:
-                num = len(self.samples) if step.axis is _BASE_AXIS else num_axis
-                errors, status = None, entrant.skips(_reads(step), step.condition.has_keypoints)
+                num = len(self.samples) if step.axis is BASE_AXIS else num_axis
+                errors, status = None, entrant.skips(step.axis.reads, step.condition.has_keypoints)
                 if not status and has_failed:
                     status = "not measured"
                 elif not status:
@@ -87,7 +89,7 @@ class RenderedBenchmark:
                     try:
                         errors = self._errors(entrant, step.condition, num, store)
                     except ValueError as error:
-                        status, has_failed = _FAILED, has_failed or step.axis is _BASE_AXIS
+                        status, has_failed = FAILED, has_failed or step.axis is BASE_AXIS
                         failures.append(f"{describe(step)}: {error}")
                 measured.append(Measured(entrant, step, errors, status))
         return self._outcome(entrants, measured, failures, num_axis)
@@ -118,20 +120,20 @@ class RenderedBenchmark:
     def _outcome(
         self, entrants: Sequence[Entrant], measured: list[Measured], failures: list[str], num_axis: int
     ) -> Outcome:
-        bases = [each for each in measured if each.step.axis is _BASE_AXIS]
-        groups = self._groups(bases)
-        rows = [_row(each) for each in measured] + [row for _, _, rows in groups for row in rows]
-        sections = [_base_section(bases, len(self.samples))]
+        bases = [each for each in measured if each.step.axis is BASE_AXIS]
+        groups = group_rows(self.samples, bases)
+        rows = [result_row(each) for each in measured] + [row for _, _, rows in groups for row in rows]
+        sections = [base_section(bases, len(self.samples))]
         for axis in self.axes:
             of_axis = [each for each in measured if each.step.axis is axis]
-            if any(each.errors is not None or each.status == _FAILED for each in of_axis):
-                sections.append(_axis_section(axis, of_axis, num_axis))
+            if any(each.errors is not None or each.status == FAILED for each in of_axis):
+                sections.append(axis_section(axis, of_axis, num_axis))
             else:
                 sections[0].notes.append(f"Axis left out, which no predictor reads: {axis.label}.")
-        sections += [_group_section(name, label, bases, of_group) for name, label, of_group in groups]
-        sections.append(_details_section(bases))
+        sections += [group_section(name, label, of_group) for name, label, of_group in groups]
+        sections.append(details_section(bases))
         metrics = {
-            f"benchmark/{each.entrant.name} ({_BASES[each.step.with_keypoints]})": float(
+            f"benchmark/{each.entrant.name} ({BASES[each.step.with_keypoints]})": float(
                 each.errors["mpjpe"].mean()
             )
             for each in bases
@@ -148,246 +150,7 @@ class RenderedBenchmark:
             {**self.samples.facts, "samples of an axis": num_axis},
             sections,
             rows,
-            _sample_rows(measured),
+            sample_rows(measured),
             failures,
             metrics,
         )
-
-    def _groups(self, bases: Sequence[Measured]) -> list[tuple[str, str, list[dict[str, Any]]]]:
-        """Of each way to divide the samples its name, its label and rows of results, group by group."""
-        divided = []
-        for label, names in self.samples.groups().items():
-            rows = []
-            for group in sorted(set(names.tolist()), key=_leading_number):
-                for each in bases:
-                    of_group = None if each.errors is None else chosen(each.errors, names == group)
-                    rows.append(_row(each, label, group, int((names == group).sum()), of_group))
-            divided.append((label.split(",")[0].replace(" ", "_"), label, rows))
-        visible, rows = self.samples.visible(), []
-        for group, mask in (("visible", visible), ("occluded", ~visible)):
-            for each in bases:
-                row = _row(each, "joints", group, int(mask.sum()), None)
-                if each.errors is not None and mask.any():
-                    errors = each.errors["joints_mm"][mask].astype(np.float64)
-                    row |= {
-                        "status": "",
-                        "mpjpe_mean": float(errors.mean()),
-                        "mpjpe_median": float(np.median(errors)),
-                    }
-                    row |= {
-                        "under_5cm": float(100 * (errors < 50).mean()),
-                        "under_10cm": float(100 * (errors < 100).mean()),
-                    }
-                rows.append(row)
-        divided.append(("visibility", "joints", rows))
-        return divided
-
-
-_MEASURES_VERSION = 1
-"""Raised with every change of what is measured."""
-_BASE_AXIS = Axis("base", "base", ("",), lambda condition, _: condition)
-
-
-def _reads(step: Step) -> str:
-    """What a predictor has to read for a step."""
-    return step.axis.reads
-
-
-def describe(step: Step) -> str:
-    """A step in a few words."""
-    words = _BASES[step.with_keypoints] if step.axis is _BASE_AXIS else f"{step.axis.label} {step.value}"
-    return words if step.with_keypoints or step.axis is _BASE_AXIS else f"{words}, no keypoints"
-
-
-def _row(
-    each: Measured,
-    axis: str | None = None,
-    value: Any = None,
-    num: int | None = None,
-    errors: Errors | None = None,
-) -> dict[str, Any]:
-    """A row of `results.csv`: of a condition, or of a group of the base condition's samples."""
-    if axis is None:
-        axis, value, errors = each.step.axis.name, each.step.value, each.errors
-        num = None if errors is None else len(errors["mpjpe"])
-    row = {
-        "predictor": each.entrant.name,
-        "axis": axis,
-        "value": value,
-        "keypoints": "given" if each.step.with_keypoints else "none",
-        "samples": num,
-        "status": each.status,
-    }
-    return (
-        row
-        | dict.fromkeys((column.key for column in COLUMNS), "")
-        | summary(errors or {"mpjpe": np.empty(0)})
-    )
-
-
-def _sample_rows(measured: Sequence[Measured]) -> Iterator[dict[str, Any]]:
-    """The rows of `samples.csv`."""
-    for each in measured:
-        if each.errors is None:
-            continue
-        names = [name for name in each.errors if name != "joints_mm"]
-        for number in range(len(each.errors["mpjpe"])):
-            yield {
-                "predictor": each.entrant.name,
-                "axis": each.step.axis.name,
-                "value": each.step.value,
-                "keypoints": "given" if each.step.with_keypoints else "none",
-                "sample": number,
-                **{name: f"{each.errors[name][number]:.3f}" for name in names},
-            }
-
-
-def _leading_number(group: str) -> tuple[float, str]:
-    """Sorts ranges by their lower end, and other names by themselves."""
-    head = group.partition("-")[0]
-    return (float(head), group) if head.isdigit() else (0.0, group)
-
-
-def _cell(row: Mapping[str, Any], key: str) -> Entry:
-    value = row.get(key)
-    if isinstance(value, float):
-        return entry(value)
-    status = row.get("status") or None
-    return Entry(_FAILED, "word") if status == _FAILED else entry(status)
-
-
-_BASE_COLUMNS = (
-    "mpjpe_mean", "mpjpe_median", "mpjpe_p90", "root_aligned_mean", "procrustes_mean", "under_10cm", "exchanged",
-    "pve_mean", "pve_median", "pve_root_aligned_mean",
-)  # fmt: skip
-
-
-def _base_section(bases: Sequence[Measured], num: int) -> Section:
-    """All predictors under the base condition, a row each."""
-    sheet = _sheet_of_columns(bases, _BASE_COLUMNS)
-    notes = [
-        f"{num} samples; keypoints with 10 px of noise, or none; depth with 1 mm of noise. Errors in mm, in the camera "
-        "frame where no alignment is named; PVE: of the mesh's vertices."
-    ]
-    return Section("base", "Base condition", sheet, (), notes)
-
-
-def _details_section(bases: Sequence[Measured]) -> Section:
-    """Every number of the base condition."""
-    rest = [column.key for column in COLUMNS if column.key not in _BASE_COLUMNS]
-    return Section("details", "Base condition, all other numbers", _sheet_of_columns(bases, rest))
-
-
-def _sheet_of_columns(bases: Sequence[Measured], keys: Sequence[str]) -> Sheet:
-    labels = {column.key: column.label for column in COLUMNS}
-    rows = []
-    for each in bases:
-        if each.errors is None and each.status != _FAILED:
-            continue  # what it cannot do, or does not read
-        row = _row(each)
-        label = f"{each.entrant.name}, {_BASES[each.step.with_keypoints]}"
-        rows.append([Entry(label), *(_cell(row, key) for key in keys)])
-    return Sheet([("", 1 + len(keys))], ["", *(labels[key] for key in keys)], rows)
-
-
-class _Line(NamedTuple):
-    """A predictor's column of an axis or of groups: its numbers by value."""
-
-    predictor: str
-    colour: int
-    with_keypoints: bool
-    key: str
-    rows: Mapping[Any, Mapping[str, Any]]
-
-    @property
-    def heading(self) -> str:
-        """Below the predictor's name."""
-        label = "PVE" if self.key == "pve_mean" else "MPJPE"
-        return label if self.with_keypoints else f"{label}, no keypoints"
-
-
-def _lines(rows: Sequence[Mapping[str, Any]]) -> list[_Line]:
-    """The columns of rows: for each predictor, with keypoints and without, joints and, where it has them, meshes."""
-    by_line: dict[tuple[str, bool], dict[Any, Mapping[str, Any]]] = {}
-    for row in rows:
-        by_line.setdefault((row["predictor"], row["keypoints"] == "given"), {})[row["value"]] = row
-    predictors = list(dict.fromkeys(predictor for predictor, _ in by_line))
-    lines = []
-    for predictor in predictors:
-        of_predictor = {key[1]: values for key, values in by_line.items() if key[0] == predictor}
-        # A way of prediction that it has not is not worth a column, unless it has none at all.
-        shown = {key: values for key, values in of_predictor.items() if _has(values, "mpjpe_mean")}
-        for with_keypoints, values in (shown or dict([next(iter(of_predictor.items()))])).items():
-            for key in ("mpjpe_mean", "pve_mean"):
-                if key == "mpjpe_mean" or _has(values, key):
-                    lines.append(_Line(predictor, predictors.index(predictor), with_keypoints, key, values))
-    return lines
-
-
-def _has(values: Mapping[Any, Mapping[str, Any]], key: str) -> bool:
-    return any(isinstance(row.get(key), float) for row in values.values())
-
-
-def _sheet_of_lines(
-    lines: Sequence[_Line], values: Sequence[Any], counts: Sequence[int] | None = None
-) -> Sheet:
-    """Values down, predictors across; with the numbers of samples where they differ."""
-    groups: list[tuple[str, int]] = []
-    for line in lines:
-        if groups and groups[-1][0] == line.predictor:
-            groups[-1] = (line.predictor, groups[-1][1] + 1)
-        else:
-            groups.append((line.predictor, 1))
-    rows = []
-    for number, value in enumerate(values):
-        cells = [_cell(line.rows[value], line.key) if value in line.rows else entry(None) for line in lines]
-        count = [] if counts is None else [Entry(str(counts[number]))]
-        rows.append([Entry(str(value)), *count, *cells])
-    extra = 0 if counts is None else 1
-    return Sheet(
-        [("", 1 + extra), *groups], ["", *["number"] * extra, *(line.heading for line in lines)], rows
-    )
-
-
-def _charts(lines: Sequence[_Line], values: Sequence[Any], label: str) -> list[str]:
-    """Means over an axis of numbers: a chart of the joints' errors, and one of the meshes'."""
-    if not all(isinstance(value, int | float) for value in values):
-        return []
-    charts = []
-    for key, title in (("mpjpe_mean", "MPJPE"), ("pve_mean", "PVE")):
-        series = []
-        for line in lines:
-            points = [(float(value), row.get(key)) for value, row in line.rows.items()]
-            numbers = tuple((x, y, None) for x, y in points if isinstance(y, float))
-            if line.key == key and numbers:
-                words = line.predictor if line.with_keypoints else f"{line.predictor}, no keypoints"
-                series.append(Series(words, numbers, line.colour, is_dashed=not line.with_keypoints))
-        charts.append(line_chart(series, f"{title} by {label}", label, f"{title}, mm"))
-    return charts
-
-
-def _axis_section(axis: Axis, measured: Sequence[Measured], num: int) -> Section:
-    lines = _lines([_row(each) for each in measured])
-    if axis.is_of_mesh and any(line.key == "pve_mean" for line in lines):
-        lines = [line for line in lines if line.key == "pve_mean" or not _has(line.rows, "pve_mean")]
-    name = f"{axis.label[0].upper()}{axis.label[1:]}"
-    notes = [f"Means in mm over the first {num} samples."]
-    return Section(
-        axis.name, name, _sheet_of_lines(lines, axis.values), _charts(lines, axis.values, axis.label), notes
-    )
-
-
-def _group_section(
-    name: str, label: str, bases: Sequence[Measured], rows: Sequence[Mapping[str, Any]]
-) -> Section:
-    lines = _lines(rows)
-    values = list(dict.fromkeys(row["value"] for row in rows))
-    counts = [next(row["samples"] for row in rows if row["value"] == value) for value in values]
-    title = f"By {label}" if label != "joints" else "Visible and occluded joints"
-    what = "joints" if label == "joints" else "samples"
-    notes = [f"The base condition's {what}, means in mm; number: of {what} in the group."]
-    if label == "joints":
-        notes.append(
-            "A joint is visible where the depth at its pixel is the body's and at most 0.15 m before the joint."
-        )
-    return Section(name, title, _sheet_of_lines(lines, values, counts), (), notes)
