@@ -11,9 +11,9 @@ from ljn.geometry.camera import Camera
 JUMP_M, JUMP_SHARE = 0.05, 0.02
 """Neighbours whose depth differs by more than the first, and this share of it (a structured-light sensor's steps), belong
 to different pieces."""
-NEAR_M = 0.35
+NEAR_M = 0.5
 """A piece this near to the person belongs to it: a limb before or behind the trunk."""
-THIN_M, RIM_M = 0.05, 0.1
+THIN_M, RIM_M = 0.05, 0.15
 """A piece nowhere thicker than the first, behind what is beside it, and farther than the second from the person, is a rim
 of the background, left by a mask too wide."""
 SPECK_M2, SPECK_PX, STRAY_M = 0.0005, 3, 0.08
