@@ -11,8 +11,8 @@ from ljn.pipeline.report import Report
 _FARTHEST_M = 20.0  # no depth camera sees a person farther away
 _NEAREST_MM = 100.0
 _INVALID_MM = 65000  # codes of sensors for "nothing measured", from here on
-AREA_M2 = (0.1, 1.0)
-"""Seen across the line of sight, a person has some 0.17 to 0.8 square metres, in any pose, dressed or not; what has less
+AREA_M2 = (0.07, 1.0)
+"""Seen across the line of sight, a person has some 0.17 to 0.7 square metres, in any pose, dressed or not; what has less
 than the first or more than the second is none. `python -m tests.benchmarks.input_checks` measures it."""
 DOUBTFUL_M2 = (0.15, 0.85)
 """Outside of these it may be one: a child, somebody half hidden, or two people."""
