@@ -106,7 +106,7 @@ class SynthesisSettings:
 
     def smallest(self, camera: Camera) -> Camera:
         """The camera with the smallest image and the narrowest view that a sample may have."""
-        return _varied(camera, self.focal_factors[1], self.pixel_factors[0])
+        return varied_camera(camera, self.focal_factors[1], self.pixel_factors[0])
 
     def densest_focal_px(self, camera: Camera) -> float:
         """The longest focal length that a sample may have, pixels."""
@@ -239,10 +239,6 @@ class DepthSynthesizer:
 
         gender = torch.from_numpy(self.records.gender[rows])
         vertices, joints = self._smpl(pose, betas, gender)
-        if self.sensor is not None and with_depth:
-            vertices = vertices.contiguous()
-            for mesh, key, row in zip(vertices.numpy(), keys, gender.tolist()):
-                self.sensor.dress(mesh, self._body_of[row], self._seed(key, _PERSON))
         vertices, joints = body_to_camera(vertices), body_to_camera(joints)
         transl = torch.from_numpy(
             np.stack(
@@ -254,6 +250,9 @@ class DepthSynthesizer:
         ).to(self.dtype)
         joints = joints + transl[:, None]
         if with_depth:
+            if self.sensor is not None:  # after the bodies have their places, which clothes do not change
+                for mesh, key, row in zip(vertices.numpy(), keys, gender.tolist()):
+                    self.sensor.dress(mesh, self._body_of[row], self._seed(key, _PERSON))
             depth = self._images(vertices + transl[:, None], cameras)
         else:
             depth = [np.zeros((0, 0), np.float32)] * len(keys)
@@ -283,7 +282,7 @@ class DepthSynthesizer:
             return self.camera
         rng = self._rng(key, _CAMERA)
         factors = [math.exp(rng.uniform(math.log(low), math.log(high))) for low, high in ranges]
-        return _varied(self.camera, *factors)
+        return varied_camera(self.camera, *factors)
 
     def _images(self, vertices: Tensor, cameras: Sequence[Camera]) -> list[np.ndarray]:
         """The depth images of meshes, each by its camera: all at once where that is the same."""
@@ -347,7 +346,7 @@ class DepthSynthesizer:
         return fill_missing(np.where(is_left[:, None], keypoints, np.nan)), is_left.astype(np.float32)
 
 
-def _varied(camera: Camera, focal_factor: float, pixel_factor: float) -> Camera:
+def varied_camera(camera: Camera, focal_factor: float, pixel_factor: float) -> Camera:
     """A camera with another focal length in an image of the same shape, then with another number of pixels."""
     width, height = (max(1, round(size * pixel_factor)) for size in (camera.width, camera.height))
     along_u, along_v = width / camera.width, height / camera.height

@@ -13,7 +13,8 @@ from omegaconf import DictConfig, OmegaConf
 from ljn.reading import brief, reason
 
 OWN_MODULES = (
-    "ljn.nets.", "ljn.modules.", "ljn.geometry.camera.", "ljn.cloud.observation.", "datamodules.", "callbacks.",
+    "ljn.nets.", "ljn.modules.", "ljn.geometry.camera.", "ljn.cloud.observation.", "ljn.benchmark.", "datamodules.",
+    "callbacks.",
 )  # fmt: skip
 """The modules whose classes a config may name."""
 _FOREIGN_BASES = {
@@ -99,6 +100,23 @@ def build(config: DictConfig | Mapping[str, Any], **arguments: Any) -> Any:
         if isinstance(error.__cause__, ValueError | FileNotFoundError | ImportError):
             raise error.__cause__ from None
         raise ValueError(reason(error, 1000)) from error
+
+
+def build_foreign(config: Mapping[str, Any], where: str) -> Any:
+    """The object of a plain node that was typed in a call: of any class, since it is the user's own code.
+
+    Never for a node of a file from elsewhere, such as a checkpoint's. Errors begin with `where`.
+
+    Raises:
+        ValueError: There is no such class, or it does not take these arguments, or refuses them.
+        FileNotFoundError: It misses a file.
+    """
+    try:
+        return hydra.utils.instantiate({"_convert_": "all", **config})
+    except hydra.errors.InstantiationException as error:
+        if isinstance(error.__cause__, FileNotFoundError):
+            raise error.__cause__ from None
+        raise ValueError(f"{where}: {reason(error.__cause__ or error, 1000)}") from error
 
 
 def build_each(configs: DictConfig | None) -> list[Any]:

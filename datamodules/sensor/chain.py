@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import MISSING, dataclass, fields
 from functools import cached_property
 from typing import NamedTuple
 
@@ -13,7 +13,7 @@ from ljn.body import BodyModel
 from ljn.cloud.observation import body_box
 from ljn.geometry.camera import Camera
 
-_BORDER_PX = 12
+BORDER_PX = 12
 """Room around the body that steps see, for what is added to it."""
 _LEAST_LEFT = 0.15
 """Of a body's pixels; where a chain leaves fewer, the image stays as it was."""
@@ -35,10 +35,18 @@ class Shot(NamedTuple):
     intrinsics: np.ndarray
     joints: np.ndarray
 
+    @property
+    def box(self) -> tuple[int, int]:
+        """Height and width of the body's box, pixels; `BORDER_PX` are around it."""
+        height, width = self.depth.shape
+        return height - 2 * BORDER_PX, width - 2 * BORDER_PX
+
 
 @dataclass(frozen=True, kw_only=True)
 class Step:
     """Base of the steps. A subclass does one thing, in the one of these methods that it overrides.
+
+    Its fields are numbers; those of two numbers are ranges.
 
     Attributes:
         share: Share of the samples that go through it; 0 switches it off.
@@ -49,13 +57,20 @@ class Step:
     def __post_init__(self) -> None:
         name = type(self).__name__
         for field in fields(self):
-            value = getattr(self, field.name)
-            if isinstance(value, list | tuple):
-                value = tuple(map(float, value))
-                object.__setattr__(self, field.name, value)
-            numbers = value if isinstance(value, tuple) else (value,)
+            value, default = getattr(self, field.name), field.default
+            numbers = tuple(value) if isinstance(value, list | tuple) else (value,)
             if not all(isinstance(number, int | float) and math.isfinite(number) for number in numbers):
                 raise ValueError(f"{name}.{field.name}: expected a number or numbers, got {value!r}")
+            if isinstance(default, tuple) and len(default) == 2:
+                if not isinstance(value, list | tuple) or len(value) != 2 or value[0] > value[1]:
+                    raise ValueError(
+                        f"{name}.{field.name}: expected 2 numbers, lowest and highest, got {value!r}"
+                    )
+            elif default is not MISSING and isinstance(value, list | tuple) != isinstance(default, tuple):
+                expected = "numbers" if isinstance(default, tuple) else "a number"
+                raise ValueError(f"{name}.{field.name}: expected {expected}, got {value!r}")
+            if isinstance(value, list | tuple):
+                object.__setattr__(self, field.name, tuple(map(float, value)))
         if not 0 <= self.share <= 1:
             raise ValueError(f"{name}.share: expected a share between 0 and 1, got {self.share}")
 
@@ -68,7 +83,7 @@ class Step:
         return betas
 
     def dress(self, vertices: np.ndarray, body: BodyModel, rng: np.random.Generator, strength: float) -> None:
-        """Change the surface `(V, 3)`, metres, in place; joints stay."""
+        """Change the surface `(V, 3)`, metres, in the camera's axes, in place; joints and the body's place stay."""
 
     def expose(self, shot: Shot, rng: np.random.Generator, strength: float) -> None:
         """Change the image, in place."""
@@ -135,11 +150,11 @@ class Sensor:
             return
         # With a border all around, even beyond the image, where it is forgotten again.
         body = depth[top : bottom + 1, left : right + 1]
-        part = np.zeros((body.shape[0] + 2 * _BORDER_PX, body.shape[1] + 2 * _BORDER_PX), np.float32)
-        part[_BORDER_PX:-_BORDER_PX, _BORDER_PX:-_BORDER_PX] = body
+        part = np.zeros((body.shape[0] + 2 * BORDER_PX, body.shape[1] + 2 * BORDER_PX), np.float32)
+        part[BORDER_PX:-BORDER_PX, BORDER_PX:-BORDER_PX] = body
         spans = np.empty((len(part), 2), np.int64)
         number = kernels.row_spans(part, spans)
-        left, top = left - _BORDER_PX, top - _BORDER_PX
+        left, top = left - BORDER_PX, top - BORDER_PX
         intrinsics = np.array([camera.fx, camera.fy, camera.cx - left, camera.cy - top])
         shot = Shot(part, spans, intrinsics, np.asarray(joints))
         for step, rng, strength in self._drawn(key, "expose"):

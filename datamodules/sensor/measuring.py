@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from datamodules.sensor import kernels
-from datamodules.sensor.chain import Shot, Step
+from datamodules.sensor.chain import BORDER_PX, Shot, Step
 
 
 def seed_of(rng: np.random.Generator) -> np.uint64:
@@ -183,9 +183,9 @@ class Holes(Step):
 
     def expose(self, shot: Shot, rng: np.random.Generator, strength: float) -> None:
         """See `Step`."""
-        height, width = shot.depth.shape
+        height, width = shot.box
         for _ in range(rng.integers(0, int(self.most) + 1)):
-            u, v = rng.random(2) * (width, height)
+            u, v = BORDER_PX + rng.random(2) * (width, height)
             half_u, half_v = strength * max(width, height) * rng.uniform(*self.size, 2)
             kernels.clear_shape(
                 shot.depth, u, v, max(half_u, 0.5), max(half_v, 0.5), rng.uniform(0, np.pi), False

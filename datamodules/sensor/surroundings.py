@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from datamodules.sensor import kernels
-from datamodules.sensor.chain import Shot, Step
+from datamodules.sensor.chain import BORDER_PX, Shot, Step
 from datamodules.sensor.measuring import seed_of
 from ljn.body.skeleton import JOINT_INDEX
 
@@ -35,14 +35,14 @@ class Occluder(Step):
 
     def expose(self, shot: Shot, rng: np.random.Generator, strength: float) -> None:
         """See `Step`."""
-        height, width = shot.depth.shape
+        height, width = shot.box
         area = strength * rng.uniform(*self.cover) * height * width
         aspect = math.exp(rng.uniform(-1.2, 1.2))
         half_u, half_v = math.sqrt(area * aspect) / 2, math.sqrt(area / aspect) / 2
-        u, v = rng.random(2) * (width, height)
+        u, v = BORDER_PX + rng.random(2) * (width, height)
         is_box = bool(rng.random() < 0.5)
         if is_box and rng.random() < 0.5:  # a table: everything from a height down, on one side
-            u, v = rng.choice([0, width]), height
+            u, v = BORDER_PX + rng.choice([0, width]), BORDER_PX + height
             half_u, half_v = 2 * half_u, 2 * half_v
         angle = 0.1 * rng.standard_normal() if is_box else rng.uniform(0, math.pi)
         kernels.clear_shape(shot.depth, u, v, max(half_u, 0.5), max(half_v, 0.5), angle, is_box)
@@ -113,18 +113,17 @@ class CutOff(Step):
 
     def expose(self, shot: Shot, rng: np.random.Generator, strength: float) -> None:
         """See `Step`."""
-        height, width = shot.depth.shape
         part = strength * self.most * rng.random()
-        rows, columns = round(part * height), round(part * width)
+        rows, columns = (BORDER_PX + round(part * side) for side in shot.box)
         side = rng.choice(4, p=[0.5, 0.1, 0.2, 0.2])  # feet most often
         if side == 0:
-            shot.depth[height - rows :] = 0
+            shot.depth[-rows:] = 0
         elif side == 1:
             shot.depth[:rows] = 0
         elif side == 2:
             shot.depth[:, :columns] = 0
         else:
-            shot.depth[:, width - columns :] = 0
+            shot.depth[:, -columns:] = 0
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,7 +1,7 @@
 """The trained stages as one function: depth, camera and 2D keypoints in, joints and mesh out."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
@@ -15,7 +15,7 @@ from ljn.geometry.rotations import rotmat_to_rotvec
 from ljn.modules.joint_detector import JointDetector
 from ljn.modules.mesh_regressor import MeshRegressor
 from ljn.pipeline.depth import body_depth
-from ljn.pipeline.keypoints import MIN_KNOWN, check_place, smpl_keypoints
+from ljn.pipeline.keypoints import MIN_KNOWN, Keypoints, check_place, smpl_keypoints
 from ljn.refinement import Refiner, chosen_settings, refine, second_look
 from ljn.runs.checkpoints import Checkpoint, load_module
 from ljn.runs.packages import DEFAULT, find_package, stages_of
@@ -250,41 +250,66 @@ class Pipeline:
                 "keypoints: expected the person's 2D keypoints, which this joint detector takes, got none; give them, "
                 "or a detector that can do without: experiment=detector/cascade"
             )
-        positions, confidences = (None, None) if named is None else named
+        return self.observe_body(metres, camera, named)
+
+    def observe_body(
+        self,
+        depth: np.ndarray,
+        camera: Camera,
+        keypoints: Keypoints | None = None,
+        num_points: int | None = None,
+    ) -> ObservedFrame:
+        """Observe an image that is known to be right, for each stage.
+
+        Args:
+            depth: `(H, W)` float32, metres; 0 is background.
+            camera: The camera of this image.
+            keypoints: Those of the 24 joints; None for a detector that can do without.
+            num_points: Points of the clouds; None: as in each stage's training.
+        """
+        positions, confidences = (None, None) if keypoints is None else keypoints
 
         def observed(stage: Stage, takes: set[str]) -> Observation:
-            rng = np.random.default_rng(_SEED)
-            return observe(metres, camera, positions, stage.recipe, takes, rng, confidences)
+            rng, recipe = np.random.default_rng(_SEED), stage.recipe
+            if num_points is not None:
+                recipe = replace(recipe, num_points=num_points)
+            return observe(depth, camera, positions, recipe, takes, rng, confidences)
 
-        takes = {*self.detector.module.takes, "points", *(() if named is None else ("initial_joints",))}
+        takes = {*self.detector.module.takes, "points", *(() if keypoints is None else ("initial_joints",))}
         if self.refiner is not None:
             takes |= set(self.refiner.takes)
         regressor = None
         if self.regressor is not None:
             # Its initial joints are the detector's.
             regressor = observed(self.regressor, set(self.regressor.module.takes) - {"initial_joints"})
-        return ObservedFrame(metres, observed(self.detector, takes), regressor, confidences)
+        return ObservedFrame(depth, observed(self.detector, takes), regressor, confidences)
 
     @torch.inference_mode()
-    def predict(self, frames: Sequence[ObservedFrame]) -> Prediction:
-        """Run the networks on a batch of at least one frame, all with keypoints or all without."""
+    def predict(self, frames: Sequence[ObservedFrame], joints: np.ndarray | None = None) -> Prediction:
+        """Run the networks on a batch of at least one frame, all with keypoints or all without.
+
+        `joints` `(B, 24, 3)`, metres, camera frame, stand in place of the detector's, which then does not run.
+        """
         if len({frame.confidences is None for frame in frames}) > 1:
             raise ValueError(
                 "keypoints: some images of the batch have them and some have not; predict them in two batches"
             )
         detector = self.detector.module
         seen = stack_observations([frame.detector for frame in frames])
-        joints = detector(_on(detector.device, seen))
+        if joints is None:
+            found = detector(_on(detector.device, seen))
+        else:
+            found = torch.from_numpy(joints).to(detector.device, torch.float32)
         arrays = {"points": seen["points"]}
         confidences = [frame.confidences for frame in frames if frame.confidences is not None]
         if confidences:
             arrays |= {name: seen[name] for name in ("initial_joints", "keypoints")}
             arrays["confidences"] = torch.from_numpy(np.stack(confidences))
         if self.regressor is not None:
-            made, joints = self._meshes(self.regressor.module, frames, seen, joints)
+            made, found = self._meshes(self.regressor.module, frames, seen, found, looks=joints is None)
             arrays |= made
         return Prediction(
-            joints.cpu().numpy(), **{name: value.cpu().numpy() for name, value in arrays.items()}
+            found.cpu().numpy(), **{name: value.cpu().numpy() for name, value in arrays.items()}
         )
 
     def _meshes(
@@ -293,8 +318,9 @@ class Pipeline:
         frames: Sequence[ObservedFrame],
         detected: dict[str, torch.Tensor],
         joints: torch.Tensor,
+        looks: bool,
     ) -> tuple[dict[str, torch.Tensor], torch.Tensor]:
-        """A prediction's arrays of its meshes, and the joints that they began with."""
+        """A prediction's arrays of its meshes, and the joints that they began with; `looks`: the detector may again."""
         seen = stack_observations([frame.regressor for frame in frames if frame.regressor is not None])
 
         def regress(observations: Mapping[str, torch.Tensor]) -> tuple[torch.Tensor, torch.Tensor]:
@@ -307,7 +333,8 @@ class Pipeline:
         if self.refiner is not None:
             detector = self.detector.module
             # A second look at points alone would be at those of the detector's recipe.
-            detect = second_look(detector) if set(regressor.takes) <= {"initial_joints"} else None
+            looks = looks and set(regressor.takes) <= {"initial_joints"}
+            detect = second_look(detector) if looks else None
             refined, joints = refine(
                 *(self.refiner, _on(detector.device, detected), joints, (rotmats, betas)),
                 *(detect, regress),

@@ -23,18 +23,25 @@ def to_html(results: Results) -> str:
         markup.section("pictures", "Best, median and worst test samples", sections.pictures(results)),
         markup.section("runs", "Where each number comes from", sections.provenance(runs)),
     ]
+    footer = (
+        "Means over seeds ± standard deviation. Thesis: Chang, <cite>3D Human Pose and Shape Estimation from Point "
+        "Clouds with Local Joint Network</cite>, National Taiwan University, 2021."
+    )
+    return document(f"{results.sweep.name}: results", _header(results), parts, footer)
+
+
+def document(title: str, header: str, parts: Iterable[str], footer: str) -> str:
+    """A whole page: a title in plain text; header, parts and footer of HTML."""
     return (
         '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
         '<meta name="color-scheme" content="light dark">\n<link rel="icon" href="data:,">\n'
-        f"<title>{escape(results.sweep.name)}: results</title>\n<style>{STYLE}</style>\n</head>\n<body>\n"
-        + _header(results)
+        f"<title>{escape(title)}</title>\n<style>{STYLE}</style>\n</head>\n<body>\n"
+        + header
         + "\n<main>\n"
         + "\n".join(parts)
-        + "\n</main>\n<footer>Means over seeds ± standard deviation. Thesis: Chang, <cite>3D Human Pose and Shape "
-        "Estimation from Point Clouds with Local Joint Network</cite>, National Taiwan University, 2021.</footer>\n"
-        "</body>\n</html>\n"
+        + f"\n</main>\n<footer>{footer}</footer>\n</body>\n</html>\n"
     )
 
 
@@ -85,10 +92,6 @@ def _table_section(results: Results, table: TableResult) -> str:
 
 def _table(table: TableResult, runs: Sequence[Run]) -> str:
     page = writers.sheet(table)
-    head = (
-        [markup.group(name, span) if name else "<th></th>" for name, span in page.groups],
-        [markup.column(name) if name else "<th></th>" for name in page.columns],
-    )
     rows = []
     for row, entries in zip(table.rows, page.rows):
         names = {runs.index(run): "run" if run.seed is None else f"seed {run.seed}" for run in row.runs}
@@ -98,7 +101,24 @@ def _table(table: TableResult, runs: Sequence[Run]) -> str:
         _row(entry.label, (escape(entry.source),), entries)
         for entry, entries in zip(table.table.literature, page.rows[len(table.rows) :])
     ]
-    return markup.table(table.table.title, head, rows, literature)
+    return markup.table(table.table.title, _head(page), rows, literature)
+
+
+def sheet_table(title: str, page: writers.Sheet) -> str:
+    """A sheet as a table of its own."""
+    rows = [_row(entries[0].text, (), entries) for entries in page.rows]
+    return markup.table(title, _head(page), rows)
+
+
+def _head(page: writers.Sheet) -> list[list[str]]:
+    """The headings of a sheet's columns, groups above them where it has some."""
+    groups = [markup.group(name, span) if name else _blank(span) for name, span in page.groups]
+    columns = [markup.column(name) if name else "<th></th>" for name in page.columns]
+    return [groups, columns] if any(name for name, _ in page.groups) else [columns]
+
+
+def _blank(span: int) -> str:
+    return "<th></th>" if span == 1 else f'<th colspan="{span}"></th>'
 
 
 def _row(label: str, below: Sequence[str], entries: Sequence[writers.Entry]) -> str:

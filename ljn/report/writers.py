@@ -165,7 +165,13 @@ def to_text(results: Results) -> str:
 
 
 def _text_table(results: Results, table: TableResult) -> str:
-    page = sheet(table)
+    title = f"{table.table.title} (preset {results.sweep.preset})"
+    lines = [title, *text_lines(sheet(table)), describe_order(table)]
+    return "\n".join(lines).removesuffix("\n")
+
+
+def text_lines(page: Sheet) -> list[str]:
+    """A sheet as lines of plain text: its headings, then its rows."""
     widths = [max(map(len, column)) for column in zip(page.columns, *page.texts)]
     start = 0
     heading = []
@@ -181,14 +187,8 @@ def _text_table(results: Results, table: TableResult) -> str:
         numbers = (text.rjust(width) for text, width in zip(texts[1:], widths[1:]))
         return "  ".join([texts[0].ljust(widths[0]), *numbers]).rstrip()
 
-    title = f"{table.table.title} (preset {results.sweep.preset})"
-    lines = [
-        title,
-        "  ".join(heading).rstrip(),
-        *map(line, [page.columns, *page.texts]),
-        describe_order(table),
-    ]
-    return "\n".join(lines).removesuffix("\n")
+    headings = ["  ".join(heading).rstrip()] if any(name for name, _ in page.groups) else []
+    return [*headings, *map(line, [page.columns, *page.texts])]
 
 
 def to_csv(results: Results) -> str:
@@ -212,20 +212,24 @@ def to_markdown(results: Results) -> str:
     """The tables in Markdown, with footnotes, orderings and failed runs."""
     parts = [f"# {_markdown(results.sweep.name)}"]
     for table in results.tables:
-        page = sheet(table)
-        groups = [name for name, span in page.groups for _ in range(span)]
-        names = [f"{group}: {column}" if group else column for group, column in zip(groups, page.columns)]
-        lines = [[_markdown(text) for text in texts] for texts in (names, *page.texts)]
-        lines.insert(1, ["---"] + ["---:"] * (len(names) - 1))
         parts += [
             f"## {_markdown(table.table.title)}",
-            "\n".join(f"| {' | '.join(texts)} |" for texts in lines),
+            "\n".join(markdown_lines(sheet(table))),
             _markdown(describe_order(table)),
             "\n".join(f"- {_markdown(describe_comparison(entry))}" for entry in table.comparisons),
             "\n".join(_markdown(note) + "  " for note in notes(results, table)).rstrip(),
         ]
     parts.append("\n".join(f"- {_markdown(describe_job(run))}" for run in results.lost))
     return "\n\n".join(part for part in parts if part) + "\n"
+
+
+def markdown_lines(page: Sheet) -> list[str]:
+    """A sheet as the lines of a table in Markdown."""
+    groups = [name for name, span in page.groups for _ in range(span)]
+    names = [f"{group}: {column}" if group else column for group, column in zip(groups, page.columns)]
+    lines = [[_markdown(text) for text in texts] for texts in (names, *page.texts)]
+    lines.insert(1, ["---"] + ["---:"] * (len(names) - 1))
+    return [f"| {' | '.join(texts)} |" for texts in lines]
 
 
 def to_latex(results: Results) -> str:

@@ -7,11 +7,11 @@ if TYPE_CHECKING:
     from omegaconf import DictConfig
 
 CONF = Path(__file__).parents[2] / "conf"
-GROUPS = ("experiment", "sweep", "preset")
+GROUPS = ("experiment", "sweep", "preset", "bench")
 
 
 def list_choices(cfg: "DictConfig | None" = None) -> dict[str, float]:
-    """Print the experiments, sweeps and presets with a line on each; no metrics come back."""
+    """Print the experiments, sweeps, presets and benchmarks with a line on each; no metrics come back."""
     for group in GROUPS:
         lines = descriptions(CONF / group)
         width = max(map(len, lines), default=0)

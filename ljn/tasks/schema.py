@@ -22,6 +22,8 @@ class Config:
     tables: list[str] = field(default_factory=list)
     optimized_metric: str = "val/mpjpe"
     task: Any = None
+    bench: Any = None
+    predictor: Any = None
     preset: Any = None
     data: Any = None
     body: Any = None

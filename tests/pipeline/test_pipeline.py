@@ -12,6 +12,7 @@ from ljn.geometry.camera import Camera, project
 from ljn.geometry.rotations import CAMERA_FROM_BODY
 from ljn.modules.joint_detector import JointDetector
 from ljn.nets.cascade import PatchCascade
+from ljn.pipeline.keypoints import smpl_keypoints
 from ljn.pipeline.pipeline import Pipeline
 from ljn.render import get_renderer
 
@@ -200,3 +201,23 @@ def test_a_detector_that_can_do_without_takes_all_keypoints_some_or_none(stages,
     assert min(np.abs(a - b).max() for a, b in itertools.combinations(joints, 2)) > 0.01
     with pytest.raises(ValueError, match="keypoints: some images of the batch have them"):
         pipeline(depth, kinect, [None, keypoints])
+
+
+def test_given_joints_stand_in_place_of_the_detectors(pipeline, given, kinect):
+    depth, keypoints = given
+    frame = pipeline.observe(depth, kinect, keypoints)
+    found = pipeline.predict([frame])
+    again = pipeline.predict([frame], found.joints)
+    np.testing.assert_array_equal(again.vertices, found.vertices)
+    moved = pipeline.predict([frame], found.joints + np.float32(0.1))
+    np.testing.assert_allclose(moved.mesh_joints[:, 0], found.mesh_joints[:, 0] + 0.1, atol=1e-5)
+    np.testing.assert_array_equal(moved.joints, found.joints + np.float32(0.1))
+
+
+def test_a_cloud_of_another_number_of_points_can_be_asked_for(pipeline, given, kinect):
+    depth, keypoints = given
+    named = smpl_keypoints(keypoints)
+    same, fewer = (pipeline.observe_body(depth, kinect, named, number) for number in (None, 64))
+    expected = pipeline.observe(depth, kinect, keypoints)
+    np.testing.assert_array_equal(same.detector["points"], expected.detector["points"])
+    assert fewer.detector["points"].shape == fewer.regressor["points"].shape == (64, 6)

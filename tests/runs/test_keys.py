@@ -51,8 +51,8 @@ def test_every_key_has_a_row_and_every_row_a_key():
         ("module/mesh_regressor.yaml", "new: {nested: null}", "module.new.nested"),
         ("callbacks/default.yaml", "new: null", "callbacks.new"),
         ("experiment/mesh/chain.yaml", "data: {new: 1}", "data.new"),
-        ("data/sensor/kinect.yaml", "new: null", "data.sensor.new"),
-        ("data/sensor/kinect.yaml", "", "data.sensor"),
+        ("data/lens/wide.yaml", "new: null", "data.lens.new"),
+        ("data/lens/wide.yaml", "", "data.lens"),
         ("sensor/kinect.yaml", "new: null", "sensor.new"),
     ],
 )

@@ -64,6 +64,7 @@ def test_a_key_of_several_tasks_is_short_in_each():
     for task in ("task=predict", "task=demo", "task=package"):
         assert prepare_arguments([task, "mesh_ckpt_path=a=b"]) == [task, "task.mesh_ckpt_path='a=b'"]
     with pytest.raises(
-        ValueError, match="mesh_ckpt_path: only task=predict, task=demo and task=package read this"
+        ValueError,
+        match="mesh_ckpt_path: only task=predict, task=demo, task=package and task=benchmark read this",
     ):
         prepare_arguments(["task=train", "mesh_ckpt_path=x"])
