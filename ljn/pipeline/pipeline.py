@@ -15,7 +15,8 @@ from ljn.geometry.rotations import rotmat_to_rotvec
 from ljn.modules.joint_detector import JointDetector
 from ljn.modules.mesh_regressor import MeshRegressor
 from ljn.pipeline.depth import body_depth
-from ljn.pipeline.keypoints import MIN_KNOWN, check_place, smpl_keypoints
+from ljn.pipeline.keypoints import MIN_KNOWN, body_keypoints
+from ljn.pipeline.report import Report
 from ljn.refinement import Refiner, chosen_settings, refine, second_look
 from ljn.runs.checkpoints import Checkpoint, load_module
 from ljn.runs.packages import DEFAULT, find_package, stages_of
@@ -211,7 +212,7 @@ class Pipeline:
             depth: `(H, W)` or `(B, H, W)`: floating-point metres, or integer millimetres; 0 where nothing was
                 measured.
             camera: The camera of the images.
-            keypoints: See `smpl_keypoints`; of a batch, one such value for each image. None, or some of them alone, for
+            keypoints: See `body_keypoints`; of a batch, one such value for each image. None, or some of them alone, for
                 a detector that can do without.
             mask: `(H, W)` or `(B, H, W)`, not 0 on the person; None where depth is 0 everywhere else already.
 
@@ -238,13 +239,23 @@ class Pipeline:
                 raise ValueError(f"image {number} of the batch: {error}") from error
         return self.predict(observations)
 
-    def observe(self, depth: Any, camera: Camera, keypoints: Any = None, mask: Any = None) -> ObservedFrame:
-        """Check one image's input and observe it for each stage; arguments as in a call."""
+    def observe(
+        self,
+        depth: Any,
+        camera: Camera,
+        keypoints: Any = None,
+        mask: Any = None,
+        report: Report | None = None,
+    ) -> ObservedFrame:
+        """Check one image's input and observe it for each stage; arguments as in a call.
+
+        The report takes what was found and done.
+        """
         metres = body_depth(depth, camera, mask)
         named = None
         if keypoints is not None:
-            named = smpl_keypoints(keypoints, MIN_KNOWN if self.needs_keypoints else 1)
-            check_place(named, metres, camera)
+            min_known = MIN_KNOWN if self.needs_keypoints else 1
+            named = body_keypoints(keypoints, metres, camera, min_known, report)
         elif self.needs_keypoints:
             raise ValueError(
                 "keypoints: expected the person's 2D keypoints, which this joint detector takes, got none; give them, "
