@@ -24,6 +24,7 @@ MIN_KNOWN = 8
 some 300 px tall; `tests/benchmarks/keypoint_filling.py` measures this and makes the covariance."""
 
 _OUTSIDE = 0.05  # how far beyond the image a keypoint may lie, of the image's longer side
+_FARTHEST_PX = 1e6  # beyond, one place is as wrong as another
 _SHARES = 2  # keypoints that are all between 0 and this are no pixels
 _PERCENT = 20  # confidences of which one is higher are in percent
 _CLOSE = 0.3  # orders whose likelihoods' logs differ by less are not told apart
@@ -290,7 +291,7 @@ def _named(person: Person, order: str, report: Report) -> _Named:
     """A person's keypoints, in one of its orders."""
     table = person.table
     confidences = _confidences(table[:, 2], order, report)
-    places = table[:, :2]
+    places = table[:, :2].clip(-_FARTHEST_PX, _FARTHEST_PX)
     with np.errstate(invalid="ignore"):
         is_known = np.isfinite(places).all(1) & places.any(1) & ~(places < 0).all(1)
     is_known &= confidences >= MIN_CONFIDENCE
