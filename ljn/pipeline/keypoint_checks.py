@@ -23,7 +23,7 @@ from ljn.geometry.camera import Camera
 from ljn.pipeline.filling import conditional_misfit, fill_missing, joint_covariance, log_likelihood
 from ljn.pipeline.keypoint_orders import middles_of, taken_by
 
-MISFIT_M = 0.21
+MISFIT_M = 0.22
 """Keypoints of a higher misfit are refused."""
 DOUBTFUL_MISFIT_M = 0.16
 """Keypoints of a higher misfit are doubted."""
@@ -40,9 +40,11 @@ WILD_OFF = 3.5
 OFF_M = 0.3
 """See `WILD_OFF`."""
 MIN_SKELETON = 8
-"""With fewer known joints the others cannot be filled in well, and only places on the body are checked."""
+"""With fewer known joints the others cannot be filled in well, and most is not checked."""
 FEW_OFF_M = 0.3
-"""Fewer than `MIN_SKELETON` keypoints are refused where they lie farther off the body, on average."""
+"""Fewer than `MIN_SKELETON` keypoints are refused where they lie farther off the body, on average, ..."""
+FEW_MISFIT_M = 0.28
+"""... or are of a higher misfit, which is not measured of less than 4."""
 
 _MIN_ANY_SKELETON = 4  # with fewer, nothing is measured but places on the body
 _NOISE = 10 / 366.458  # of keypoints, radians: that of the training
@@ -86,7 +88,7 @@ class Fit(NamedTuple):
         bare_m: Mean distance of the body's pixels to the bones, likewise; 0 where too few keypoints are known.
         oddness: How unlike a body they are by themselves; 0 where too few are known.
         share: Of the known keypoints, on the body or within 0.1 m.
-        is_few: Whether too few are known to be judged but by their places.
+        is_few: Whether fewer than `MIN_SKELETON` are known.
     """
 
     off_m: float
@@ -104,7 +106,7 @@ class Fit(NamedTuple):
     def is_impossible(self) -> bool:
         """Whether keypoints are refused for it."""
         if self.is_few:
-            return self.off_m > FEW_OFF_M
+            return self.off_m > FEW_OFF_M or self.misfit_m > FEW_MISFIT_M
         return self.misfit_m > MISFIT_M or self.oddness > ODDNESS
 
     @property
@@ -118,8 +120,6 @@ class Fit(NamedTuple):
         words = (
             f"{100 * self.share:.0f} % of them on the body or within 0.1 m, {self.off_m:.2f} m off on average"
         )
-        if self.is_few:
-            return words
         return f"{words}, the body {self.bare_m:.2f} m from their bones, {self.oddness:.1f} times as odd as a body's"
 
 
@@ -216,8 +216,8 @@ def better_reading(positions: np.ndarray, body: Body, is_refused: bool) -> tuple
     Args:
         positions: `(24, 2)`, NaN where not known.
         body: The body.
-        is_refused: Whether keypoints are refused in any case. Shifts and scales of any size are then tried, too; these
-            fit right keypoints a little better as well.
+        is_refused: Whether keypoints are refused in any case. Mirrored ones, and shifts and scales of any size, are
+            then tried, too; these may fit right keypoints a little better as well.
     """
     best: tuple[str, Fit] | None = None
     for words, read in _readings(positions, body, is_refused):
@@ -233,12 +233,11 @@ def _readings(p: np.ndarray, body: Body, with_any: bool) -> Iterator[tuple[str, 
     right, bottom = camera.width - 1, camera.height - 1
     yield "with u and v swapped", p[:, ::-1]
     yield f"with v counted from below ({bottom} - v)", np.stack([p[:, 0], bottom - p[:, 1]], 1)
-    yield f"with u counted from the right ({right} - u)", np.stack([right - p[:, 0], p[:, 1]], 1)
     for factor in _FACTORS:
         yield f"multiplied by {factor:.3g} (as of an image of {1 / factor:.3g} times the size)", factor * p
     if not with_any:
         return
-    yield "as shares of the image's size", p * [camera.width, camera.height]
+    yield f"with u counted from the right ({right} - u)", np.stack([right - p[:, 0], p[:, 1]], 1)
     corners = body.cells.min(0), body.cells.max(0)
     focal, centre = np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy])
     low, high = (corner / body.depth_m * focal + centre for corner in corners)

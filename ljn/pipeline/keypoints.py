@@ -24,6 +24,7 @@ MIN_KNOWN = 8
 some 300 px tall; `tests/benchmarks/keypoint_filling.py` measures this and makes the covariance."""
 
 _OUTSIDE = 0.05  # how far beyond the image a keypoint may lie, of the image's longer side
+_ONE_PLACE_M = 0.05  # keypoints whose standard deviation is less lie at one place
 _FARTHEST_PX = 1e6  # beyond, one place is as wrong as another
 _SHARES = 2  # keypoints that are all between 0 and this are no pixels
 _PERCENT = 20  # confidences of which one is higher are in percent
@@ -231,8 +232,8 @@ def _check_fit(judged: _Judged, body: checks.Body, person: Person, report: Repor
     is_better = better is not None and better[1].misfit_m < fit.misfit_m - checks.BETTER_M
     if is_refused or is_better:
         would = (
-            "no other reading was found that does; are they of another image or person, or in another order? Known are "
-            f"{', '.join(ORDERS)}"
+            f"{_at_one_place(judged.positions, body)}no other reading was found that does; are they of another "
+            f"image or person, or in another order? Known are {', '.join(ORDERS)}"
             if better is None
             else f"{better[0]} they would: {better[1]}"
         )
@@ -242,6 +243,12 @@ def _check_fit(judged: _Judged, body: checks.Body, person: Person, report: Repor
             f"keypoints: as {named.order} they hardly fit the body ({fit}); look at the picture of the prediction, and "
             "give those of this image and person"
         )
+
+
+def _at_one_place(positions: np.ndarray, body: checks.Body) -> str:
+    places = body.places(positions[np.isfinite(positions[:, 0])])
+    is_one = len(places) > 2 and np.linalg.norm(places.std(0)) < _ONE_PLACE_M
+    return "they all lie at one place; " if is_one else ""
 
 
 def _all_confident(person: Person, named: _Named, body: checks.Body) -> tuple[str, checks.Fit] | None:
