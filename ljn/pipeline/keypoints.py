@@ -103,7 +103,8 @@ def smpl_keypoints(keypoints: Any, min_known: int = MIN_KNOWN) -> Keypoints:
     people = read_people(keypoints)
     if len(people) > 1:
         raise ValueError(f"keypoints: expected one person, got {len(people)}; {_CHOOSE}")
-    named = _named(people[0], people[0].orders[0], Report())
+    person = _sure(people[0], Report())
+    named = _named(person, person.orders[0])
     if named.num_known < min_known:
         raise ValueError(_too_few(named, min_known))
     return _filled(named)
@@ -140,8 +141,8 @@ def body_keypoints(
         report.note(keypoint_persons=len(people), keypoint_person=number)
     else:
         (person,) = people
-    person = _in_pixels(person, camera, report)
-    judged = _in_order(person, body, min_known, report)
+    person = _sure(_in_pixels(person, camera, report), report)
+    judged = _in_order(person, body, min_known)
     named, is_wild, fit = judged
     if is_wild.any():
         report.doubt(
@@ -173,8 +174,8 @@ def _only_fitting(people: Sequence[Person], body: checks.Body, min_known: int) -
     fitting, last_error = [], ""
     for number, person in enumerate(people):
         try:
-            scaled = _in_pixels(person, body.camera, Report())
-            fit = _in_order(scaled, body, min_known, Report()).fit
+            scaled = _sure(_in_pixels(person, body.camera, Report()), Report())
+            fit = _in_order(scaled, body, min_known).fit
         except ValueError as error:
             last_error = f" (the last of the others: {error})"
             continue
@@ -187,9 +188,9 @@ def _only_fitting(people: Sequence[Person], body: checks.Body, min_known: int) -
     )
 
 
-def _in_order(person: Person, body: checks.Body, min_known: int, report: Report) -> _Judged:
+def _in_order(person: Person, body: checks.Body, min_known: int) -> _Judged:
     """The keypoints in the order that is likeliest on the body, and how well they fit."""
-    read = {order: _named(person, order, report) for order in orders_of(len(person.table))}
+    read = {order: _named(person, order) for order in orders_of(len(person.table))}
     order, *others = person.orders
     if len(read) == 1:
         return _judged(read[order], body, min_known)
@@ -254,7 +255,7 @@ def _at_one_place(positions: np.ndarray, body: checks.Body) -> str:
 def _all_confident(person: Person, named: _Named, body: checks.Body) -> tuple[str, checks.Fit] | None:
     """The reading without confidences, where that fits."""
     sure = person._replace(table=np.concatenate([person.table[:, :2], np.ones((len(person.table), 1))], 1))
-    read = _named(sure, named.order, Report())
+    read = _named(sure, named.order)
     found = checks.fit(read.positions, body)
     if read.num_known == named.num_known or found.is_doubtful:
         return None
@@ -294,11 +295,16 @@ def _in_pixels(person: Person, camera: Camera, report: Report) -> Person:
     return person._replace(table=np.concatenate([pixels, person.table[:, 2:]], 1))
 
 
-def _named(person: Person, order: str, report: Report) -> _Named:
-    """A person's keypoints, in one of its orders."""
-    table = person.table
-    confidences = _confidences(table[:, 2], order, report)
-    places = table[:, :2].clip(-_FARTHEST_PX, _FARTHEST_PX)
+def _sure(person: Person, report: Report) -> Person:
+    """The keypoints with confidences from 0 to 1 as the third numbers."""
+    confidences = _confidences(person.table[:, 2], person.orders[0], report)
+    return person._replace(table=np.concatenate([person.table[:, :2], confidences[:, None]], 1))
+
+
+def _named(person: Person, order: str) -> _Named:
+    """A person's keypoints in an order of their length."""
+    places, confidences = person.table[:, :2], person.table[:, 2]
+    places = places.clip(-_FARTHEST_PX, _FARTHEST_PX)
     with np.errstate(invalid="ignore"):
         is_known = np.isfinite(places).all(1) & places.any(1) & ~(places < 0).all(1)
     is_known &= confidences >= MIN_CONFIDENCE

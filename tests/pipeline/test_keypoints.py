@@ -88,23 +88,6 @@ def test_null_nan_zero_and_doubtful_keypoints_count_as_missing(truth):
         assert found.confidences[4] == 0
 
 
-def test_filling_moves_turns_and_scales_with_the_body(truth):
-    is_missing = np.isin(JOINT_NAMES, ["l_hand", "spine2", "r_knee", "head"])
-    turn = np.array([[0.6, -0.8], [0.8, 0.6]])
-    given = np.where(is_missing[:, None], np.nan, truth)
-    filled = fill_missing(given)
-    np.testing.assert_array_equal(filled[~is_missing], truth[~is_missing])
-    np.testing.assert_allclose(fill_missing(3 * given @ turn.T + [5, -7]), 3 * filled @ turn.T + [5, -7])
-
-
-@pytest.mark.parametrize("joint", ["pelvis", "spine2", "l_collar", "l_wrist", "r_foot", "head"])
-def test_a_single_missing_joint_is_filled_in_nearby(joint, truth):
-    given = truth.copy()
-    given[JOINT_INDEX[joint]] = np.nan
-    error = np.linalg.norm(fill_missing(given)[JOINT_INDEX[joint]] - truth[JOINT_INDEX[joint]])
-    assert error < 0.1 * np.ptp(truth[:, 1])
-
-
 def people(keypoints):
     """What OpenPose writes of one person."""
     return {"people": [{"pose_keypoints_2d": keypoints}]}
@@ -268,7 +251,8 @@ def test_confidences_of_no_known_kind_are_doubted(coco, body):
     coco[:, 2] = 7.5
     report = Report()
     assert body_keypoints(coco, *body, report=report).confidences.max() == 1
-    assert "confidences of up to 7.5 are neither from 0 to 1" in report.warnings[0]
+    (warning,) = report.warnings
+    assert "confidences of up to 7.5 are neither from 0 to 1" in warning
     with pytest.raises(ValueError, match=r"up to 7\.5 .*strict"):
         body_keypoints(coco, *body, report=Report(is_strict=True))
 
