@@ -13,6 +13,7 @@ from ljn.geometry.rotations import CAMERA_FROM_BODY
 from ljn.modules.joint_detector import JointDetector
 from ljn.nets.cascade import PatchCascade
 from ljn.pipeline.pipeline import Pipeline
+from ljn.pipeline.report import Report
 from ljn.render import get_renderer
 
 
@@ -167,6 +168,18 @@ def test_bad_input_is_an_error_that_says_how_to_mend_it(change, message, pipelin
     depth, keypoints = change(*given)
     with pytest.raises(ValueError, match=f"(?s){message}"):
         pipeline(depth, kinect, keypoints)
+
+
+def test_what_the_keypoints_were_is_reported(pipeline, given, kinect):
+    depth, keypoints = given
+    keypoints[20] = [15, 20]
+    report = Report()
+    frame = pipeline.observe(depth, kinect, keypoints, report=report)
+    assert report.facts["keypoint_order"] == "smpl24"
+    assert report.facts["keypoints_mistrusted"] == ["l_wrist"]
+    assert frame.confidences[20] == 0
+    with pytest.raises(ValueError, match=r"keypoints: l_wrist lie far .*strict=true"):
+        pipeline.observe(depth, kinect, keypoints, report=Report(is_strict=True))
 
 
 def test_a_bad_mask_is_an_error(pipeline, given, kinect):
