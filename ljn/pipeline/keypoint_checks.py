@@ -33,6 +33,9 @@ DOUBTFUL_ODDNESS = 1.65
 """Keypoints of a higher oddness are doubted."""
 BETTER_M = 0.03
 """Keypoints are refused, too, where another reading's misfit is less by this."""
+EXPLAINED_M, EXPLAINED_SHARE = 0.06, 0.35
+"""A body with less that is bare of bones, and so much of the keypoints on or near it, is cut off or hidden in part:
+keypoints are doubted at the most."""
 WILD = 4.5
 """A keypoint is mistrusted from this many standard deviations away from where the others expect it."""
 WILD_OFF = 3.5
@@ -107,7 +110,12 @@ class Fit(NamedTuple):
         """Whether keypoints are refused for it."""
         if self.is_few:
             return self.off_m > FEW_OFF_M or self.misfit_m > FEW_MISFIT_M
-        return self.misfit_m > MISFIT_M or self.oddness > ODDNESS
+        return (self.misfit_m > MISFIT_M and not self.is_explained) or self.oddness > ODDNESS
+
+    @property
+    def is_explained(self) -> bool:
+        """Whether what does not fit are keypoints of parts that are not seen."""
+        return not self.is_few and self.bare_m < EXPLAINED_M and self.share >= EXPLAINED_SHARE
 
     @property
     def is_doubtful(self) -> bool:

@@ -227,7 +227,9 @@ def _check_fit(judged: _Judged, body: checks.Body, person: Person, report: Repor
     is_refused = fit.is_impossible
     if not (is_refused or checks.is_suspicious(fit)):
         return
-    better = checks.better_reading(judged.positions, body, is_refused)
+    better = None
+    if is_refused or not fit.is_explained:
+        better = checks.better_reading(judged.positions, body, is_refused)
     if is_refused:
         better = better or _all_confident(person, named, body)
     is_better = better is not None and better[1].misfit_m < fit.misfit_m - checks.BETTER_M

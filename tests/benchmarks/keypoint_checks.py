@@ -30,7 +30,7 @@ WILD, SURE, UNSURE = (
     (0.0, 0.15),
 )  # share of wild keypoints where confidences tell them; those
 MOVED_M = 0.15
-MUTATED_EVERY = 4  # samples
+MOST_MUTATED = 2500  # samples, at most half of them
 CHUNK = 32
 GIVEN = ("coco17", "body25", "kinect25", "smpl24", "h36m17", "coco18", "azure32", "mediapipe33")
 
@@ -109,6 +109,7 @@ def measure(number: int, split: str = "test", seed: int = 0, made: Iterator[Samp
     found: dict[str, Counter[str]] = defaultdict(Counter)
     examples: dict[str, str] = {}
     milliseconds = []
+    every = max(2, number // MOST_MUTATED)
     for index, sample in enumerate(made or samples(split, number, seed)):
         rng = np.random.default_rng([seed, index])
         order = GIVEN[index // len(SENSORS) % len(GIVEN)]
@@ -134,7 +135,7 @@ def measure(number: int, split: str = "test", seed: int = 0, made: Iterator[Samp
             right[name].update(event for event, is_so in events.items() if is_so)
         if is_refused or is_other:
             examples.setdefault(f"{sample.sensor} {sample.family} {order}", error or str(report.facts))
-        if index % MUTATED_EVERY or result is None:
+        if index % every or result is None:
             continue
         for name, mutated in _mutated(true, noise, order, sample, rng):
             _count(found[name], examples, name, mutated, sample)

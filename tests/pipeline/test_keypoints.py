@@ -327,6 +327,17 @@ def test_a_single_wild_keypoint_is_treated_as_missing(truth, body):
     assert "r_wrist lie far from where the others expect them" in report.warnings[0]
 
 
+def test_of_a_body_that_is_cut_off_keypoints_are_doubted_at_the_most(truth, body):
+    depth, camera = body
+    v = np.flatnonzero(depth.any(1))
+    for share, is_doubted in ((0.3, False), (0.55, True)):
+        report, cut = Report(), depth.copy()
+        cut[int(v[-1] - share * (v[-1] - v[0])) :] = 0
+        found = body_keypoints(truth, cut, camera, report=report)
+        assert np.count_nonzero(found.confidences) == 24
+        assert bool(report.warnings) == is_doubted
+
+
 def test_of_several_persons_the_one_who_fits_is_taken(coco, body):
     beside = coco + np.array([150, 0, 0])
     crowd = [{"keypoints": one.tolist()} for one in (beside, coco, beside)]
