@@ -179,7 +179,7 @@ def _only_fitting(people: Sequence[Person], body: checks.Body, min_known: int) -
         except ValueError as error:
             last_error = f" (the last of the others: {error})"
             continue
-        if fit.misfit_m <= _PLAIN_MISFIT_M and not fit.is_impossible:
+        if fit.misfit_m <= _PLAIN_MISFIT_M and not fit.is_impossible and not fit.is_few:
             fitting.append((person, number))
     if len(fitting) == 1:
         return fitting[0]

@@ -33,7 +33,7 @@ class Prediction:
         points: `(N, 6)`, the cloud: position and normal.
         initial_joints: `(24, 3)`, the keypoints lifted with the depth image.
         keypoints: `(24, 2)`, those of the SMPL joints, pixels.
-        confidences: `(24,)`, the keypoints' own; 0 where a keypoint was filled in.
+        confidences: `(24,)`, the keypoints' own, from 0 to 1; 0 where a keypoint was filled in.
         vertices: `(V, 3)`, the mesh, its root joint at the detector's (Eq. 4.1-4.2).
         pose: `(72,)` axis-angle, radians; the first three turn SMPL's rest frame into body world, as in `Batch`.
         betas: `(10,)`.
