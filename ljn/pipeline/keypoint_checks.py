@@ -6,10 +6,10 @@ keypoints: the first grows where keypoints are off the body, the second where th
 is how unlike a body the keypoints are by themselves, from the covariance of joints: some 1, whatever the pose.
 
 `python -m tests.benchmarks.input_checks --keypoints` measures how often right keypoints are refused and wrong ones
-found. Thresholds are chosen on training poses. Of 20,000 test samples (`--samples 20000`: all sensors and orders, 10 px
-of noise, 30 % missing), 1 in 4,000 is refused and 1 in 500 doubted, most of them hidden in part. Of those that a mistake
-moves by more than 150 mm, it finds 99 % with u and v swapped, 94 % upside down, 97 % shifted by 80 px, 99 and 97 % scaled
-by 1.25 and 0.8, 99 % at one pixel and over 99 % in another order of 17 or 25. A check takes 0.9 ms.
+found. Thresholds are chosen on training poses. Of 20,000 test samples (`--samples 20000`: all sensors and orders, 10
+px of noise, 30 % missing), 1 in 4,000 is refused and 1 in 500 doubted, most of them hidden in part. Of those that a
+mistake moves by more than 150 mm, it finds 99 % with u and v swapped, 94 % upside down, 97 % shifted by 80 px, 99 and
+97 % scaled by 1.25 and 0.8, 99 % at one pixel and over 99 % in another order of 17 or 25. A check takes 0.9 ms.
 """
 
 import math
