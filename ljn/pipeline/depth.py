@@ -12,8 +12,8 @@ _FARTHEST_M = 20.0  # no depth camera sees a person farther away
 _NEAREST_MM = 100.0
 _INVALID_MM = 65000  # codes of sensors for "nothing measured", from here on
 AREA_M2 = (0.07, 1.0)
-"""Seen across the line of sight, a person has some 0.17 to 0.7 square metres, in any pose, dressed or not; what has less
-than the first or more than the second is none. `python -m tests.benchmarks.input_checks` measures it."""
+"""Seen across the line of sight, a person has some 0.17 to 0.7 square metres, in any pose, dressed or not; what has
+less than the first or more than the second is none. `python -m tests.benchmarks.input_checks` measures it."""
 DOUBTFUL_M2 = (0.15, 0.85)
 """Outside of these it may be one: a child, somebody half hidden, or two people."""
 _SPAN_M = (0.4, 2.9)  # of the longest side: from a crouching child to a tall man who reaches up
@@ -24,9 +24,9 @@ _MUCH = 0.2
 def body_depth(depth: Any, camera: Camera, mask: Any = None, report: Report | None = None) -> np.ndarray:
     """Depth of the person alone.
 
-    Pixels that are NaN, infinite, negative, 0 or a sensor's code for nothing (from 65,000 on, in integers) are no depth.
-    Of what the mask leaves, the largest piece that hangs together in space, and all that is near it, is the person (see
-    `find_person`): a rim of the background, flying pixels and what is farther away are dropped, and counted.
+    Pixels that are NaN, infinite, negative, 0 or a sensor's code for nothing (from 65,000 on, in integers) are no
+    depth. Of what the mask leaves, the largest piece that hangs together in space, and all that is near it, is the
+    person (see `find_person`): a rim of the background, flying pixels and what is farther away are dropped and counted.
 
     Args:
         depth: `(H, W)` or `(H, W, 1)`: floating-point metres, or integer millimetres; 0 where nothing was measured.
@@ -50,10 +50,13 @@ def body_depth(depth: Any, camera: Camera, mask: Any = None, report: Report | No
     _check_principal_point(camera, report)
     metres = _metres(depth, is_inside, report)
     if not metres.any():
+        if is_inside is not None and _is_measured(depth).any():
+            raise ValueError(
+                "mask: no pixel of the mask has a depth; is it black, inverted, or of another image?"
+            )
         raise ValueError(
-            "depth: all pixels are 0 or invalid, nothing was measured; is the file or the stream the right one?"
-            if is_inside is None
-            else "mask: no pixel of the mask has a depth; is it black, inverted, or of another image?"
+            f"depth: all pixels are 0, or no depth ({np.count_nonzero(depth)} are negative, NaN, infinite or a "
+            "code for nothing): nothing was measured; is the file or the stream the right one?"
         )
     person = find_person(metres, camera)
     num_pixels = int(np.count_nonzero(person.depth))
@@ -71,8 +74,8 @@ def body_depth(depth: Any, camera: Camera, mask: Any = None, report: Report | No
     if num_dropped > _MUCH * num_pixels:
         report.doubt(
             f"depth: {num_dropped} pixels beside the person's {num_pixels} were dropped, {person.num_foreign} of them "
-            f"too far from it in space to be a part of it ({person.foreign_m2:.2f} square metres) and {person.num_rim} at "
-            "its rim; is somebody or something else in the mask? Give a mask of the person alone"
+            f"too far from it in space to be a part of it ({person.foreign_m2:.2f} square metres) and {person.num_rim} "
+            "at its rim; is somebody or something else in the mask? Give a mask of the person alone"
         )
     return person.depth
 
@@ -81,9 +84,9 @@ def person_mask(mask: Any, chosen: int | None = None) -> np.ndarray:
     """A mask as people have them as `(H, W)` bool, true on the person.
 
     Args:
-        mask: `(H, W)` bool; numbers of which 0 is background and any other one number the person; a soft matte (0 to 1, 0
-            to 255 or more), from half its greatest value on; an index map, with the person's number in `chosen`; `(H, W, 4)`
-            with an alpha channel that is not the same everywhere, or `(H, W, 3)` or `(H, W, 1)` of these.
+        mask: `(H, W)` bool; numbers of which 0 is background and any other one number the person; a soft matte (0 to
+            1, 0 to 255 or more), from half its greatest value on; an index map, with the person's number in `chosen`;
+            `(H, W, 4)` with an alpha channel that is not the same everywhere, or `(H, W, 3)` or `(H, W, 1)` of these.
         chosen: Of an index map, the number of the person; of another mask, the one that counts.
 
     Raises:
@@ -151,9 +154,16 @@ def _check_principal_point(camera: Camera, report: Report) -> None:
     as_given, swapped = (np.abs(point - middle) / size for point in (given, given[::-1]))
     if as_given.max() > 0.08 and swapped.max() < 0.04:
         report.doubt(
-            f"camera: cx = {camera.cx:g} and cy = {camera.cy:g} lie far from the middle of an image of {camera.width} x "
-            f"{camera.height} (width x height) pixels, and would lie near it if they were swapped; are they?"
+            f"camera: cx = {camera.cx:g} and cy = {camera.cy:g} lie far from the middle of an image of {camera.width} "
+            f"x {camera.height} (width x height) pixels, and would lie near it if they were swapped; are they?"
         )
+
+
+def _is_measured(depth: np.ndarray) -> np.ndarray:
+    """Whether a pixel holds a depth: `(H, W)` bool."""
+    if depth.dtype.kind in "iu":
+        return (depth > 0) & (depth < _INVALID_MM)
+    return np.isfinite(depth) & (depth > 0)
 
 
 def _metres(depth: np.ndarray, is_inside: np.ndarray | None, report: Report) -> np.ndarray:
@@ -161,7 +171,7 @@ def _metres(depth: np.ndarray, is_inside: np.ndarray | None, report: Report) -> 
     is_integer = depth.dtype.kind in "iu"
     if not is_integer and depth.dtype.kind != "f":
         raise ValueError(f"depth: expected float metres or integer millimetres, got {depth.dtype}")
-    is_valid = (depth > 0) & (depth < _INVALID_MM) if is_integer else np.isfinite(depth) & (depth > 0)
+    is_valid = _is_measured(depth)
     is_given = depth != 0
     if is_inside is not None:
         is_valid, is_given = is_valid & is_inside, is_given & is_inside
@@ -198,7 +208,9 @@ def _check_size(metres: np.ndarray, area_m2: float, camera: Camera, is_masked: b
     points = np.stack([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z], -1)
     low, high = np.percentile(points, [2, 98], axis=0)  # stray pixels should not decide
     spans = high - low
-    shown = f"{' x '.join(f'{span:.2f}' for span in spans)} m (right, down, forward), {area_m2:.2f} square metres"
+    shown = (
+        f"{' x '.join(f'{span:.2f}' for span in spans)} m (right, down, forward), {area_m2:.2f} square metres"
+    )
     causes = (
         "is the depth in another unit than metres (float) or millimetres (integer), the camera another one's, or of an "
         "image of another size (scale fx, fy, cx and cy with it)"

@@ -1,4 +1,4 @@
-"""The person's own pixels in a depth image: what hangs together in space, without what a mask or a sensor adds to it."""
+"""The person's own pixels in a depth image: what hangs together in space, without what masks and sensors add."""
 
 from typing import NamedTuple
 
@@ -9,8 +9,8 @@ from scipy.spatial import cKDTree
 from ljn.geometry.camera import Camera
 
 JUMP_M, JUMP_SHARE = 0.05, 0.02
-"""Neighbours whose depth differs by more than the first, and this share of it (a structured-light sensor's steps), belong
-to different pieces."""
+"""Neighbours whose depth differs by more than the first, and this share of it (a structured-light sensor's steps),
+belong to different pieces."""
 NEAR_M = 0.8
 """A piece this near to the person belongs to it: a limb before or behind the trunk."""
 RIM_M, THIN_M, THIN_LONG_M, LONG_M = 0.25, 0.03, 0.06, 0.6
@@ -48,9 +48,7 @@ def pieces_of(metres: np.ndarray, camera: Camera) -> Pieces:
     labels, number = _label(metres, JUMP_M, JUMP_SHARE)
     pixels, z, area, thickness, behind = _measure(metres, labels, number, JUMP_M, JUMP_SHARE)
     mean = z / np.maximum(pixels, 1)
-    return Pieces(
-        labels, area / (camera.fx * camera.fy), pixels, mean, thickness * mean / camera.fx, behind
-    )
+    return Pieces(labels, area / (camera.fx * camera.fy), pixels, mean, thickness * mean / camera.fx, behind)
 
 
 class Person(NamedTuple):
@@ -188,7 +186,7 @@ def _label(metres: np.ndarray, jump: float, share: float) -> tuple[np.ndarray, i
 def _measure(
     metres: np.ndarray, labels: np.ndarray, number: int, jump: float, share: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Of each piece: pixels, sum of depth, sum of squared depth, thickness in pixels, share of the rim that is behind."""
+    """Of each piece: pixels, sums of depth and of its square, thickness in pixels, share of the rim that is behind."""
     height, width = metres.shape
     pixels, z_sum, area = np.zeros(number, np.int64), np.zeros(number), np.zeros(number)
     thickness, rim, behind = np.zeros(number), np.zeros(number), np.zeros(number)
@@ -206,7 +204,7 @@ def _measure(
             nearest = 1 << 20
             for dv, du in ((0, -1), (-1, -1), (-1, 0), (-1, 1)):
                 row, column = v + dv, u + du
-                is_same = 0 <= row and 0 <= column < width and labels[row, column] == label
+                is_same = row >= 0 and 0 <= column < width and labels[row, column] == label
                 nearest = min(nearest, inside[row + 1, column + 1] if is_same else 0)
             inside[v + 1, u + 1] = nearest + 1
     for v in range(height - 1, -1, -1):

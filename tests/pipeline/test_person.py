@@ -11,7 +11,6 @@ from ljn.pipeline.person import pieces_of
 from ljn.pipeline.report import Report
 from ljn.render import get_renderer
 
-
 CAMERA = Camera(366.458, 366.736, 206.470, 253.026, 424, 512)
 
 
@@ -117,7 +116,7 @@ def test_a_body_of_half_the_size_is_doubted_and_one_of_a_third_refused(person):
     report = Report()
     body_depth(np.ascontiguousarray(person[::2, ::2]), half, None, report)
     assert "little for a person" in report.warnings[0]
-    with pytest.raises(ValueError, match="less than a person.*scale fx, fy, cx and cy"):
+    with pytest.raises(ValueError, match=r"less than a person.*scale fx, fy, cx and cy"):
         body_depth(person, Camera(1081.0, 1081.0, CAMERA.cx, CAMERA.cy, 424, 512))
 
 
