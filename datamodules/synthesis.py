@@ -21,7 +21,7 @@ from ljn.cloud.observation import ObservationRecipe, observe, stack_observations
 from ljn.data import Batch
 from ljn.geometry.camera import Camera, project
 from ljn.geometry.rotations import body_to_camera, rotation_about, rotmat_to_rotvec, rotvec_to_rotmat
-from ljn.pipeline.keypoints import fill_missing
+from ljn.pipeline.filling import fill_missing
 from ljn.render import RENDERERS, Renderer, get_renderer
 
 # Each purpose has a generator of its own: changing one (the number of points, a sigma) leaves the others' draws.

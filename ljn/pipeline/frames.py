@@ -1,6 +1,7 @@
 """Frames one after another, from files or a camera; one that fails does not stop the others."""
 
-from collections.abc import Callable, Iterable, Iterator
+import re
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import count, islice, pairwise
 from pathlib import Path
 from typing import Any, Generic, NamedTuple, TypeVar
@@ -12,6 +13,9 @@ from ljn.pipeline.inputs import DEPTH_SUFFIXES, read_depth, read_keypoints, read
 from ljn.pipeline.pipeline import Pipeline, Prediction
 
 FrameT = TypeVar("FrameT")
+
+_OPENPOSE_VIDEO = re.compile(r"(?P<stem>.+)_(?P<number>[0-9]{12})_keypoints\.json")
+_LAST_NUMBER = re.compile(r"[0-9]+$")
 
 
 class FrameImages(NamedTuple):
@@ -29,6 +33,7 @@ class FrameFiles(NamedTuple):
     depth: Path
     keypoints: Path | None
     mask: Path | None
+    mask_id: int | None = None  # of an index map, the person's number
 
     def read(self) -> FrameImages:
         """What the files hold.
@@ -37,7 +42,7 @@ class FrameFiles(NamedTuple):
             FileNotFoundError: One is missing.
             ValueError: One cannot be read.
         """
-        mask = None if self.mask is None else read_mask(self.mask)
+        mask = None if self.mask is None else read_mask(self.mask, self.mask_id)
         keypoints = None if self.keypoints is None else read_keypoints(self.keypoints)
         return FrameImages(read_depth(self.depth), keypoints, mask)
 
@@ -84,9 +89,16 @@ def predict_frames(
 
 
 def find_frames(
-    input: str | Path, keypoints: str | Path | None = None, mask: str | Path | None = None
+    input: str | Path,
+    keypoints: str | Path | None = None,
+    mask: str | Path | None = None,
+    mask_id: int | None = None,
 ) -> list[FrameFiles]:
     """The frames of a depth image, or of a folder of them; with keypoints and masks of the same stem in theirs.
+
+    Keypoints may also be named as OpenPose does: `STEM_keypoints.json`; `STEM_000000000012_keypoints.json`, if that is
+    the only one of its stem; or, of a video, any name with the number of a frame, if these are those that the depth
+    images' names end with.
 
     Raises:
         FileNotFoundError: There is no such file or folder, or no depth image in it.
@@ -101,7 +113,11 @@ def find_frames(
         kinds = (f"{name} is a {'folder' if path.is_dir() else 'file'}" for name, path in paths.items())
         raise ValueError(f"input, keypoints, mask: expected files or folders alike, got: {', '.join(kinds)}")
     if not paths["input"].is_dir():
-        return [FrameFiles(paths["input"].stem, paths["input"], paths.get("keypoints"), paths.get("mask"))]
+        return [
+            FrameFiles(
+                paths["input"].stem, paths["input"], paths.get("keypoints"), paths.get("mask"), mask_id
+            )
+        ]
     images = sorted(path for path in paths["input"].iterdir() if path.suffix.lower() in DEPTH_SUFFIXES)
     if not images:
         raise FileNotFoundError(f"input: no depth image ({', '.join(DEPTH_SUFFIXES)}) in '{paths['input']}'")
@@ -110,12 +126,39 @@ def find_frames(
             raise ValueError(
                 f"input: '{before.name}' and '{path.name}' would write the same outputs; rename one"
             )
+    of_stem = _keypoint_files(paths["keypoints"], [path.stem for path in images]) if keypoints else {}
     return [
         FrameFiles(
             path.stem,
             path,
-            paths["keypoints"] / f"{path.stem}.json" if keypoints else None,
+            of_stem.get(path.stem),
             paths["mask"] / f"{path.stem}.png" if mask else None,
+            mask_id,
         )
         for path in images
     ]
+
+
+def _keypoint_files(folder: Path, stems: Sequence[str]) -> dict[str, Path]:
+    """The file of each depth image's keypoints, by stem; where there is none, that which would be read first."""
+    names = {path.name for path in folder.iterdir() if path.suffix == ".json"}
+    by_number: dict[int, list[str]] = {}
+    by_stem: dict[str, list[str]] = {}
+    for name in sorted(names):
+        if match := _OPENPOSE_VIDEO.fullmatch(name):
+            by_stem.setdefault(match["stem"], []).append(name)
+            by_number.setdefault(int(match["number"]), []).append(name)
+    numbers = [int(match[0]) if (match := _LAST_NUMBER.search(stem)) else None for stem in stems]
+    # One file for each number and one image for each: anything else could be another video's.
+    is_numbered = set(numbers) == by_number.keys() and len(set(numbers)) == len(stems) == sum(
+        map(len, by_number.values())
+    )
+    found = {}
+    for stem, number in zip(stems, numbers):
+        choices = [name for name in (f"{stem}.json", f"{stem}_keypoints.json") if name in names]
+        if len(of_stem := by_stem.get(stem, [])) == 1:
+            choices += of_stem
+        if is_numbered and number is not None:
+            choices += by_number[number]
+        found[stem] = folder / (choices or [f"{stem}.json"])[0]
+    return found

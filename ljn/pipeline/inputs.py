@@ -1,12 +1,14 @@
 """Reading what a user has: depth images, masks, cameras and keypoints."""
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ljn.geometry.camera import MAX_PIXELS, Camera
+from ljn.pipeline.depth import person_mask
 from ljn.reading import READ_ERRORS, brief, read_arrays, read_json, read_yaml, reason, shown
 
 DEPTH_SUFFIXES = (".png", ".npy", ".npz")
@@ -45,15 +47,22 @@ def read_depth(path: str | Path) -> np.ndarray:
     )
 
 
-def read_mask(path: str | Path) -> np.ndarray:
-    """A mask `(H, W)` bool from a PNG: wherever any channel but alpha is not 0.
+def read_mask(path: str | Path, chosen: int | None = None) -> np.ndarray:
+    """A mask `(H, W)` bool from a PNG: black and white, a soft matte, a cut-out with alpha, or an index map.
+
+    Args:
+        path: The file.
+        chosen: See `person_mask`.
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: It cannot be read.
+        ValueError: It cannot be read, or is no mask of one person.
     """
-    image = _read_png(_existing(path, "mask"), "mask")
-    return image != 0 if image.ndim == 2 else np.logical_or.reduce(image, -1)
+    path = _existing(path, "mask")
+    try:
+        return person_mask(_read_png(path, "mask", (*_GREY, "P", "LA", "RGBA")), chosen)
+    except ValueError as error:
+        raise ValueError(f"{error} ('{path}')") from error
 
 
 def read_camera(path: str | Path) -> Camera:
@@ -117,7 +126,8 @@ def _camera_number(value: Any, key: str, path: Path) -> float:
     return number
 
 
-def _read_png(path: Path, name: str) -> np.ndarray:
+def _read_png(path: Path, name: str, modes: Sequence[str] = _GREY) -> np.ndarray:
+    """The image as an array, in RGB unless its mode is one of `modes`."""
     from PIL import Image
 
     bombs: tuple[type[Exception], ...] = (Image.DecompressionBombError, Image.DecompressionBombWarning)
@@ -128,7 +138,7 @@ def _read_png(path: Path, name: str) -> np.ndarray:
                 raise ValueError(f"{image.width} x {image.height} pixels, expected at most {MAX_PIXELS}")
             image.verify()  # compares all checksums; then it has to be opened anew
         with Image.open(path, formats=("PNG",)) as image:
-            return np.asarray(image if image.mode in _GREY else image.convert("RGB"))
+            return np.asarray(image if image.mode in modes else image.convert("RGB"))
     except (*bombs, *READ_ERRORS) as error:
         raise _unreadable(name, path, error) from error
 

@@ -1,5 +1,6 @@
 """The trained stages as one function: depth, camera and 2D keypoints in, joints and mesh out."""
 
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -11,15 +12,17 @@ import torch
 from ljn.body.skeleton import ROOT
 from ljn.cloud.observation import Observation, ObservationRecipe, observe, stack_observations
 from ljn.geometry.camera import Camera, place_at_root
-from ljn.geometry.rotations import rotmat_to_rotvec
+from ljn.geometry.rotations import CAMERA_FROM_BODY, rotmat_to_rotvec
 from ljn.modules.joint_detector import JointDetector
 from ljn.modules.mesh_regressor import MeshRegressor
 from ljn.pipeline.depth import body_depth
-from ljn.pipeline.keypoints import MIN_KNOWN, Keypoints, check_place, smpl_keypoints
+from ljn.pipeline.keypoints import MIN_KNOWN, Keypoints, body_keypoints
+from ljn.pipeline.report import Report
 from ljn.refinement import Refiner, chosen_settings, refine, second_look
 from ljn.runs.checkpoints import Checkpoint, load_module
 from ljn.runs.packages import DEFAULT, find_package, stages_of
 
+_LOG = logging.getLogger(__name__)
 _SEED = 0  # of the choice of points: the same for every image, so that equal input gives equal output
 
 
@@ -32,18 +35,22 @@ class Prediction:
         points: `(N, 6)`, the cloud: position and normal.
         initial_joints: `(24, 3)`, the keypoints lifted with the depth image.
         keypoints: `(24, 2)`, those of the SMPL joints, pixels.
-        confidences: `(24,)`, the keypoints' own; 0 where a keypoint was filled in.
+        confidences: `(24,)`, the keypoints' own, from 0 to 1; 0 where a keypoint was filled in.
         vertices: `(V, 3)`, the mesh, its root joint at the detector's (Eq. 4.1-4.2).
         pose: `(72,)` axis-angle, radians; the first three turn SMPL's rest frame into body world, as in `Batch`.
         betas: `(10,)`.
+        global_orient: `(3,)` axis-angle, radians, in the camera's axes. It, the body's pose `pose[3:]`, `betas` and
+            `transl` give any SMPL layer the same vertices in the camera frame.
+        transl: `(3,)`, the translation of an SMPL layer.
         faces: `(F, 3)` int64, vertex indices; of a batch, too.
         mesh_joints: `(24, 3)`, the mesh's own joints.
         is_refined: Whether mesh, pose and shape are fitted to the depth; false where the fit was given up.
         residual_mm: `(2,)`, median distance of the cloud's points to the mesh, as guessed and as returned.
+        report: What was found in the input, and done about it; of a batch, one for each image.
 
     Without keypoints, `initial_joints`, `keypoints` and `confidences` are None; without a mesh regressor, `vertices`,
-    `pose`, `betas`, `faces` and `mesh_joints`; without refinement, `is_refined` and `residual_mm`. With it, the mesh is
-    placed where it fits, and `joints` are those that the fit began with.
+    `pose`, `betas`, `global_orient`, `transl`, `faces` and `mesh_joints`; without refinement, `is_refined` and
+    `residual_mm`. With it, the mesh is placed where it fits, and `joints` are those that the fit began with.
     """
 
     joints: np.ndarray
@@ -58,12 +65,20 @@ class Prediction:
     mesh_joints: np.ndarray | None = None
     is_refined: np.ndarray | None = None
     residual_mm: np.ndarray | None = None
+    global_orient: np.ndarray | None = None
+    transl: np.ndarray | None = None
+    report: Report | tuple[Report, ...] = ()
+
+    @property
+    def arrays(self) -> dict[str, np.ndarray]:
+        """All arrays that there are, by name."""
+        return {name: value for name, value in vars(self).items() if isinstance(value, np.ndarray)}
 
     def __getitem__(self, index: int) -> Self:
         """One of a batch."""
         values = {field.name: getattr(self, field.name) for field in fields(self)}
         chosen = {
-            name: value if value is None or name == "faces" else value[index]
+            name: value if value is None or name == "faces" or len(value) == 0 else value[index]
             for name, value in values.items()
         }
         return type(self)(**chosen)
@@ -91,12 +106,14 @@ class ObservedFrame(NamedTuple):
         detector: The joint detector's observation, with a cloud in any case.
         regressor: The mesh regressor's; None without one.
         confidences: See `Prediction`.
+        report: What was found in the input, and done about it.
     """
 
     depth: np.ndarray
     detector: Observation
     regressor: Observation | None
     confidences: np.ndarray | None
+    report: Report
 
 
 class Pipeline:
@@ -112,16 +129,23 @@ class Pipeline:
         detector: The joint detector.
         regressor: The mesh regressor; None predicts joints alone.
         refine: Whether meshes are fitted to the depth, and how: see `ljn.refinement`. True is "accurate".
+        strict: Whether a doubt about the input, which otherwise is logged and goes into the prediction's report, is an
+            error.
 
     Raises:
         ValueError: There is no such setting, or no mesh to refine.
     """
 
     def __init__(
-        self, detector: Stage, regressor: Stage | None = None, refine: bool | str | None = None
+        self,
+        detector: Stage,
+        regressor: Stage | None = None,
+        refine: bool | str | None = None,
+        strict: bool = False,
     ) -> None:
         self.detector = detector
         self.regressor = regressor
+        self.is_strict = strict
         self.refiner: Refiner | None = None
         if (settings := chosen_settings(refine)) is not None:
             if regressor is None:
@@ -138,6 +162,7 @@ class Pipeline:
         device: str | torch.device = "cpu",
         body_path: str | Path | None = None,
         refine: bool | str | None = None,
+        strict: bool = False,
     ) -> Self:
         """The pipeline of two checkpoints.
 
@@ -148,6 +173,7 @@ class Pipeline:
             body_path: File or folder of the body whose mesh is predicted, for weights trained on bodies that are not
                 embedded; None: where it was in the training.
             refine: See the class.
+            strict: See the class.
 
         Raises:
             FileNotFoundError: There is no such file.
@@ -156,7 +182,7 @@ class Pipeline:
         module, checkpoint = load_module(detector_ckpt, JointDetector, "detector_ckpt")
         detector = _stage(module.to(device), checkpoint)
         if mesh_ckpt is None:
-            return cls(detector, refine=refine)
+            return cls(detector, refine=refine, strict=strict)
         module, mesh_checkpoint = load_module(mesh_ckpt, MeshRegressor, "mesh_ckpt", body_path)
         if unknown := mesh_checkpoint.unknown_bodies(checkpoint.body_hash.split("-")):
             raise ValueError(
@@ -170,7 +196,7 @@ class Pipeline:
                 f"here is {unknown[0]}; give the training's body file (body.path=FILE, in Python body_path=FILE), or "
                 "use the version of this library whose embedded body it was"
             )
-        return cls(detector, _stage(module.to(device), mesh_checkpoint), refine)
+        return cls(detector, _stage(module.to(device), mesh_checkpoint), refine, strict)
 
     @classmethod
     def from_pretrained(
@@ -179,6 +205,7 @@ class Pipeline:
         device: str | torch.device = "cpu",
         body_path: str | Path | None = None,
         refine: bool | str | None = None,
+        strict: bool = False,
     ) -> Self:
         """The pipeline of trained weights that ship in one file, a package.
 
@@ -188,6 +215,7 @@ class Pipeline:
             device: See `load`.
             body_path: See `load`.
             refine: See the class.
+            strict: See the class.
 
         Raises:
             FileNotFoundError: There is no such file.
@@ -196,7 +224,7 @@ class Pipeline:
         """
         path = find_package(name, "name")
         mesh = path if "mesh" in stages_of(path, "name") else None
-        return cls.load(path, mesh, device, body_path, refine)
+        return cls.load(path, mesh, device, body_path, refine, strict)
 
     @property
     def needs_keypoints(self) -> bool:
@@ -211,15 +239,15 @@ class Pipeline:
             depth: `(H, W)` or `(B, H, W)`: floating-point metres, or integer millimetres; 0 where nothing was
                 measured.
             camera: The camera of the images.
-            keypoints: See `smpl_keypoints`; of a batch, one such value for each image. None, or some of them alone, for
+            keypoints: See `body_keypoints`; of a batch, one such value for each image. None, or some of them alone, for
                 a detector that can do without.
-            mask: `(H, W)` or `(B, H, W)`, not 0 on the person; None where depth is 0 everywhere else already.
+            mask: Of an image, or a batch's: see `person_mask`; None where depth is 0 everywhere else already.
 
         Raises:
             ValueError: The input is wrong; the message says how, and of which image of a batch.
         """
         depth = np.asarray(depth)
-        if depth.ndim != 3:
+        if depth.ndim != 3 or depth.shape == (camera.height, camera.width, 1):
             return self.predict([self.observe(depth, camera, keypoints, mask)])[0]
         if len(depth) == 0:
             raise ValueError("depth: expected at least one image, got a batch of none")
@@ -238,19 +266,32 @@ class Pipeline:
                 raise ValueError(f"image {number} of the batch: {error}") from error
         return self.predict(observations)
 
-    def observe(self, depth: Any, camera: Camera, keypoints: Any = None, mask: Any = None) -> ObservedFrame:
-        """Check one image's input and observe it for each stage; arguments as in a call."""
-        metres = body_depth(depth, camera, mask)
+    def observe(
+        self,
+        depth: Any,
+        camera: Camera,
+        keypoints: Any = None,
+        mask: Any = None,
+        report: Report | None = None,
+    ) -> ObservedFrame:
+        """Check one image's input and observe it for each stage; arguments as in a call.
+
+        `report` gets what was found and done; it is the frame's, and its prediction's.
+        """
+        report = Report(is_strict=self.is_strict) if report is None else report
+        metres = body_depth(depth, camera, mask, report)
         named = None
         if keypoints is not None:
-            named = smpl_keypoints(keypoints, MIN_KNOWN if self.needs_keypoints else 1)
-            check_place(named, metres, camera)
+            min_known = MIN_KNOWN if self.needs_keypoints else 1
+            named = body_keypoints(keypoints, metres, camera, min_known, report)
         elif self.needs_keypoints:
             raise ValueError(
                 "keypoints: expected the person's 2D keypoints, which this joint detector takes, got none; give them, "
                 "or a detector that can do without: experiment=detector/cascade"
             )
-        return self.observe_body(metres, camera, named)
+        for warning in report.warnings:
+            _LOG.warning("%s", warning)
+        return self.observe_body(metres, camera, named)._replace(report=report)
 
     def observe_body(
         self,
@@ -282,7 +323,7 @@ class Pipeline:
         if self.regressor is not None:
             # Its initial joints are the detector's.
             regressor = observed(self.regressor, set(self.regressor.module.takes) - {"initial_joints"})
-        return ObservedFrame(depth, observed(self.detector, takes), regressor, confidences)
+        return ObservedFrame(depth, observed(self.detector, takes), regressor, confidences, Report())
 
     @torch.inference_mode()
     def predict(self, frames: Sequence[ObservedFrame], joints: np.ndarray | None = None) -> Prediction:
@@ -308,9 +349,9 @@ class Pipeline:
         if self.regressor is not None:
             made, found = self._meshes(self.regressor.module, frames, seen, found, looks=joints is None)
             arrays |= made
-        return Prediction(
-            found.cpu().numpy(), **{name: value.cpu().numpy() for name, value in arrays.items()}
-        )
+        reports = tuple(frame.report for frame in frames)
+        on_cpu: dict[str, Any] = {name: value.cpu().numpy() for name, value in arrays.items()}
+        return Prediction(found.cpu().numpy(), **on_cpu, report=reports)
 
     def _meshes(
         self,
@@ -347,6 +388,9 @@ class Pipeline:
             "mesh_joints": place_at_root(body.joints, body.joints[:, ROOT], root),
             "pose": rotmat_to_rotvec(rotmats).flatten(-2),
             "betas": betas,
+            "global_orient": rotmat_to_rotvec(CAMERA_FROM_BODY.to(rotmats) @ rotmats[:, 0]),
+            "transl": root
+            - body.joints[:, ROOT],  # an SMPL layer turns a body about its root, and then moves it
             "faces": regressor.body.faces,
         }
         return made, joints

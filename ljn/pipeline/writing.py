@@ -2,6 +2,7 @@
 
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -13,8 +14,9 @@ _GLTF_FROM_CAMERA = np.array([1.0, -1.0, -1.0])
 
 def write_arrays(path: Path, prediction: Prediction, camera: Camera) -> None:
     """Write a `.npz` with the prediction's arrays under their names, and `camera`: fx, fy, cx, cy, width, height."""
-    arrays = {name: value for name, value in vars(prediction).items() if value is not None}
-    np.savez_compressed(path, **arrays, camera=np.array(list(asdict(camera).values())))
+    np.savez_compressed(
+        path, **dict[str, Any](prediction.arrays), camera=np.array(list(asdict(camera).values()))
+    )
 
 
 def write_mesh(path: Path, vertices: np.ndarray, faces: np.ndarray) -> None:

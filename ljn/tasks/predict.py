@@ -18,6 +18,7 @@ from ljn.pipeline.frames import FrameFiles, find_frames, predict_frames
 from ljn.pipeline.inputs import read_camera
 from ljn.pipeline.pictures import draw_prediction
 from ljn.pipeline.pipeline import Pipeline, Prediction
+from ljn.pipeline.report import Report
 from ljn.pipeline.writing import write_arrays, write_mesh
 from ljn.refinement import chosen_settings
 from ljn.runs.files import path_part, write_json
@@ -65,7 +66,7 @@ def predict(cfg: DictConfig) -> dict[str, float]:
             got = "null" if value is None else f"{value!r}, no text: write '{key}=\"PATH\"'"
             raise ValueError(f"{key}: expected a path, got {got}; {_COMMAND}")
     camera = read_camera(task.camera)
-    frames = find_frames(task.input, task.keypoints, task.mask)
+    frames = find_frames(task.input, task.keypoints, task.mask, task.mask_id)
     directory = Path(cfg.paths.output_dir) / "predictions" / path_part(Path(task.input).stem)
     check_writable(directory)
     if cfg.num_threads is not None:
@@ -73,9 +74,11 @@ def predict(cfg: DictConfig) -> dict[str, float]:
     use_gpu = cfg.trainer.accelerator != "cpu" and torch.cuda.is_available()
     device = "cuda" if use_gpu else "cpu"
     if package:
-        pipeline = Pipeline.from_pretrained(package, device, cfg.body.path, cfg.refine)
+        pipeline = Pipeline.from_pretrained(package, device, cfg.body.path, cfg.refine, task.strict)
     else:
-        pipeline = Pipeline.load(cfg.ckpt_path, task.mesh_ckpt_path, device, cfg.body.path, cfg.refine)
+        pipeline = Pipeline.load(
+            cfg.ckpt_path, task.mesh_ckpt_path, device, cfg.body.path, cfg.refine, task.strict
+        )
     if task.keypoints is None and pipeline.needs_keypoints:
         raise ValueError(
             f"task.keypoints: expected a path, since the detector '{package or cfg.ckpt_path}' takes keypoints, got "
@@ -91,6 +94,7 @@ def predict(cfg: DictConfig) -> dict[str, float]:
     summary = {
         **metrics,
         "predict/failed": len(failed),
+        "predict/doubtful": sum(bool(result.get("warnings")) for result in results.values()),
         "detector": pipeline.detector.origin,
         "regressor": pipeline.regressor.origin if pipeline.regressor else None,
         "refine": chosen_settings(cfg.refine),
@@ -135,6 +139,8 @@ def _write(path: Path, prediction: Prediction, depth: np.ndarray, camera: Camera
     write_arrays(path.with_name(f"{path.name}.npz"), prediction, camera)
     draw_prediction(prediction, depth, camera).savefig(path.with_name(f"{path.name}.png"))
     facts: dict[str, Any] = {}
+    if isinstance(prediction.report, Report):
+        facts |= {**prediction.report.facts, "warnings": prediction.report.warnings}
     if prediction.confidences is not None:
         is_filled = prediction.confidences == 0
         facts["filled_in"] = [JOINT_NAMES[joint] for joint in np.flatnonzero(is_filled)]

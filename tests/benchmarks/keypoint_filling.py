@@ -18,7 +18,9 @@ from ljn.body import SMPL, load_body_models
 from ljn.body.skeleton import JOINT_INDEX, JOINT_NAMES, NUM_JOINTS, PARENTS
 from ljn.cloud.observation import ObservationRecipe
 from ljn.geometry.camera import Camera
-from ljn.pipeline.keypoints import COVARIANCE_PATH, MIN_KNOWN, ORDERS, fill_missing
+from ljn.pipeline.filling import COVARIANCE_PATH, fill_missing
+from ljn.pipeline.keypoint_orders import ORDERS
+from ljn.pipeline.keypoints import MIN_KNOWN
 
 CAMERA = Camera(fx=366.458, fy=366.736, cx=206.470, cy=253.026, width=424, height=512)
 NUM_TRAIN, NUM_TEST, SEED = 8192, 1024, 0

@@ -18,7 +18,7 @@ from ljn import Camera, Pipeline, get_renderer
 from ljn.body.skeleton import JOINT_INDEX, ROOT
 from ljn.geometry.camera import place_at_root, project
 from ljn.geometry.distance import distances_to_mesh
-from ljn.pipeline.keypoints import ORDERS
+from ljn.pipeline.keypoint_orders import ORDERS
 from ljn.pipeline.pictures import draw_prediction
 from ljn.pipeline.pipeline import Prediction
 

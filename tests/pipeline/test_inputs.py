@@ -119,9 +119,8 @@ def test_arrays_come_back(pipeline, given, kinect, tmp_path):
     found = pipeline(given[0], kinect, given[1])
     write_arrays(tmp_path / "found.npz", found, kinect)
     with np.load(tmp_path / "found.npz") as arrays:
-        made = {name: value for name, value in vars(found).items() if value is not None}
-        assert set(arrays.files) == {*made, "camera"}
-        for name, value in made.items():
+        assert set(arrays.files) == {*found.arrays, "camera"}
+        for name, value in found.arrays.items():
             np.testing.assert_array_equal(arrays[name], value)
         assert Camera(*arrays["camera"]) == kinect
 

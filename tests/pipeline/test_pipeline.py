@@ -1,12 +1,15 @@
 import itertools
+import pickle
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
+from scipy.sparse import csc_matrix
 
-from ljn.body import SMPL
-from ljn.body.skeleton import ROOT
+from ljn.body import SMPL, load_body_model
+from ljn.body.skeleton import PARENTS, ROOT
 from ljn.cloud.observation import ObservationRecipe, observe
 from ljn.geometry.camera import Camera, project
 from ljn.geometry.rotations import CAMERA_FROM_BODY
@@ -14,11 +17,12 @@ from ljn.modules.joint_detector import JointDetector
 from ljn.nets.cascade import PatchCascade
 from ljn.pipeline.keypoints import smpl_keypoints
 from ljn.pipeline.pipeline import Pipeline
+from ljn.pipeline.report import Report
 from ljn.render import get_renderer
 
 
 def arrays(prediction):
-    return {name: value for name, value in vars(prediction).items() if value is not None}
+    return prediction.arrays
 
 
 def assert_equal(first, second, atol=0.0):
@@ -58,6 +62,32 @@ def test_the_mesh_of_pose_and_shape_is_placed_at_the_detected_root(pipeline, giv
         found.vertices, (turned + torch.from_numpy(found.joints[ROOT])).numpy(), atol=1e-5
     )
     np.testing.assert_array_equal(found.faces, body.faces)
+
+
+def test_any_smpl_layer_gives_the_same_vertices_in_the_camera_frame(pipeline, given, kinect, tmp_path):
+    smplx = pytest.importorskip("smplx", reason="smplx is not installed")
+    body = load_body_model()
+    fields = {name: getattr(body, name) for name in ("v_template", "shapedirs", "posedirs", "weights")}
+    fields["J_regressor"] = csc_matrix(body.J_regressor)
+    fields["kintree_table"] = np.array([[2**32 - 1, *PARENTS[1:]], range(24)])
+    (tmp_path / "body.pkl").write_bytes(pickle.dumps(fields | {"f": body.faces.astype(np.uint32)}))
+    found = pipeline(given[0], kinect, given[1])
+    layer = smplx.SMPL(str(tmp_path / "body.pkl"), dtype=torch.float32)
+    names = {"betas": found.betas, "global_orient": found.global_orient, "transl": found.transl}
+    names["body_pose"] = found.pose[3:]
+    posed = layer(**{name: torch.from_numpy(value)[None] for name, value in names.items()})
+    np.testing.assert_allclose(posed.vertices[0].detach(), found.vertices, atol=1e-5)
+    np.testing.assert_allclose(posed.joints[0, :24].detach(), found.mesh_joints, atol=1e-5)
+
+
+def test_a_doubt_is_logged_and_reported_and_with_strict_an_error(stages, given, kinect, caplog):
+    swapped = replace(kinect, cx=253.0, cy=206.5)
+    found = Pipeline(*stages)(given[0], swapped, given[1])
+    assert "if they were swapped" in found.report.warnings[0]
+    assert "if they were swapped" in caplog.text
+    assert found.report.facts["pixels"] > 1000
+    with pytest.raises(ValueError, match=r"if they were swapped.*strict=true"):
+        Pipeline(*stages, strict=True)(given[0], swapped, given[1])
 
 
 def test_a_batch_gives_what_its_images_give_alone(pipeline, samples, kinect):
@@ -152,15 +182,15 @@ def test_pixels_much_denser_than_in_training_are_thinned_to_patches_of_the_same_
         (lambda d, k: (d.T, k), "depth: expected the camera's 512 x 424.*transposed, or the camera's width"),
         (lambda d, k: (d[:100], k), "depth: expected the camera's 512 x 424.*got 100 x 424.*scale its fx"),
         (lambda d, k: (0 * d, k), "depth: all pixels are 0"),
-        (lambda d, k: (np.where(d > 0, d, np.nan), k), "depth: .* pixels are NaN.*nan_to_num"),
-        (lambda d, k: (-d, k), "depth: .* pixels are negative"),
+        (lambda d, k: (np.full_like(d, np.nan), k), r"no depth \(217088 are negative, NaN"),
+        (lambda d, k: (-d, k), r"no depth \(\d+ are negative, NaN"),
         (lambda d, k: (d > 0, k), "depth: expected float metres or integer millimetres, got bool"),
         (lambda d, k: (np.where(d > 0, d, 5), k), "more than a person; give a mask of the person"),
         (lambda d, k: (0.1 * d, k), "less than a person; is the depth in another unit"),
-        (lambda d, k: (d, k + 300), r"keypoints: \d+ of 24 lie outside the image of 424 x 512"),
+        (lambda d, k: (d, k + 300), r"keypoints: as smpl24 they do not fit .*shifted by \(-\d+, -\d+\) pixels"),
         (lambda d, k: (d, k / [424, 512]), "expected pixels, but all lie between 0 and 2.*multiply"),
-        (lambda d, k: (d, k[:20]), "keypoints: expected 24 .smpl24., 17 .coco17., 25 .body25. of them, got 20"),
-        (lambda d, k: (d, k * [0.2, 0.2]), "lie near the body"),
+        (lambda d, k: (d, k[:20]), "keypoints: expected 24 .smpl24., 17 .coco17., .* of them, got 20 .a Kinect v1's"),
+        (lambda d, k: (d, k * [0.2, 0.2]), "do not fit the body .*multiplied by"),
         (lambda d, k: (d, np.where(np.arange(24)[:, None] < 7, k, np.nan)), "7 joints are known, expected at least 8"),
     ],
 )  # fmt: skip
@@ -168,6 +198,18 @@ def test_bad_input_is_an_error_that_says_how_to_mend_it(change, message, pipelin
     depth, keypoints = change(*given)
     with pytest.raises(ValueError, match=f"(?s){message}"):
         pipeline(depth, kinect, keypoints)
+
+
+def test_what_the_keypoints_were_is_reported(pipeline, given, kinect):
+    depth, keypoints = given
+    keypoints[20] = [15, 20]
+    report = Report()
+    frame = pipeline.observe(depth, kinect, keypoints, report=report)
+    assert report.facts["keypoint_order"] == "smpl24"
+    assert report.facts["keypoints_mistrusted"] == ["l_wrist"]
+    assert frame.confidences[20] == 0
+    with pytest.raises(ValueError, match=r"keypoints: l_wrist lie far .*strict=true"):
+        pipeline.observe(depth, kinect, keypoints, report=Report(is_strict=True))
 
 
 def test_a_bad_mask_is_an_error(pipeline, given, kinect):

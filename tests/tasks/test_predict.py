@@ -12,7 +12,7 @@ import ljn.tasks.predict
 from ljn import SMPL, Pipeline
 from ljn.body.skeleton import JOINT_INDEX, ROOT
 from ljn.geometry.camera import project
-from ljn.pipeline.keypoints import ORDERS
+from ljn.pipeline.keypoint_orders import ORDERS
 from ljn.render import get_renderer
 from ljn.tasks.predict import predict
 

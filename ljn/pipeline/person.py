@@ -1,0 +1,233 @@
+"""The person's own pixels in a depth image: what hangs together in space, without what masks and sensors add."""
+
+from typing import NamedTuple
+
+import numba
+import numpy as np
+from scipy.spatial import cKDTree
+
+from ljn.geometry.camera import Camera
+
+JUMP_M, JUMP_SHARE = 0.05, 0.02
+"""Neighbours whose depth differs by more than the first, and this share of it (a structured-light sensor's steps),
+belong to different pieces."""
+NEAR_M = 0.8
+"""A piece this near to the person belongs to it: a limb before or behind the trunk."""
+RIM_M, THIN_M, THIN_LONG_M, LONG_M = 0.25, 0.03, 0.06, 0.6
+"""A rim of the background, left by a mask too wide: a piece behind what is beside it, farther than the first from the
+person, and nowhere thicker than the second, or than the third where it is longer than the fourth."""
+SPECK_M2, SPECK_PX, STRAY_M = 0.0005, 3, 0.2
+"""A piece smaller than one of the first two and farther than the third from the person is a flying pixel.
+
+All of these are chosen so that rendered bodies, behind any sensor, lose nothing that a detector would miss."""
+_SAMPLE, _OF_PIECE = 1500, 12
+
+
+class Pieces(NamedTuple):
+    """The pieces of a depth image: pixels that hang together.
+
+    Attributes:
+        labels: `(H, W)` int32, the piece of each pixel from 0; -1 where nothing is measured.
+        area_m2: `(P,)`, seen area across the line of sight, square metres.
+        pixels: `(P,)`, number of pixels.
+        depth_m: `(P,)`, mean depth.
+        thickness_m: `(P,)`, the greatest thickness in the image, at its depth.
+        is_behind: `(P,)`, share of the pixels at its rim, beside other pieces, that are behind those.
+    """
+
+    labels: np.ndarray
+    area_m2: np.ndarray
+    pixels: np.ndarray
+    depth_m: np.ndarray
+    thickness_m: np.ndarray
+    is_behind: np.ndarray
+
+
+def pieces_of(metres: np.ndarray, camera: Camera) -> Pieces:
+    """The pieces of a depth image `(H, W)` float32, metres; 0 is nothing."""
+    labels, number = _label(metres, JUMP_M, JUMP_SHARE)
+    pixels, z, area, thickness, behind = _measure(metres, labels, number, JUMP_M, JUMP_SHARE)
+    mean = z / np.maximum(pixels, 1)
+    return Pieces(labels, area / (camera.fx * camera.fy), pixels, mean, thickness * mean / camera.fx, behind)
+
+
+class Person(NamedTuple):
+    """The person in a depth image.
+
+    Attributes:
+        depth: `(H, W)` float32, metres; 0 is background.
+        area_m2: Its area, seen across the line of sight.
+        foreign_m2: Area of what is too far from it in space to be a part.
+        num_foreign: Pixels of that.
+        num_rim: Pixels of a rim of the background, left by a mask too wide.
+        num_flying: Flying pixels.
+    """
+
+    depth: np.ndarray
+    area_m2: float
+    foreign_m2: float
+    num_foreign: int
+    num_rim: int
+    num_flying: int
+
+
+def find_person(metres: np.ndarray, camera: Camera, is_seed: np.ndarray | None = None) -> Person:
+    """The largest piece of a depth image and all that is near it in space, without rims and flying pixels.
+
+    Args:
+        metres: `(H, W)` float32, metres; 0 is nothing; something is there.
+        camera: The camera of this image.
+        is_seed: `(H, W)` bool, where the person is known to be: the largest piece of these pixels begins it.
+    """
+    pieces = pieces_of(metres, camera)
+    number = len(pieces.pixels)
+    # A wide rim of a background far behind may have a larger area.
+    first = int((pieces.area_m2 * np.minimum(pieces.thickness_m, 0.15) * (1.05 - pieces.is_behind)).argmax())
+    if is_seed is not None and (is_seed & (metres > 0)).any():
+        first = int(np.bincount(pieces.labels[is_seed & (metres > 0)]).argmax())
+    v, u = np.nonzero(metres)
+    z = metres[v, u].astype(np.float64)
+    points = np.stack([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z], -1)
+    of = pieces.labels[v, u]
+    order = np.argsort(of, kind="stable")
+    ends = np.cumsum(pieces.pixels)
+    samples = [
+        order[start:stop][:: max(1, (stop - start) // _OF_PIECE)]
+        for start, stop in zip(ends - pieces.pixels, ends)
+    ]
+    is_person = np.zeros(number, bool)
+    is_person[first] = True
+    distance = np.full(number, np.inf)
+    is_rim, is_flying = np.zeros(number, bool), np.zeros(number, bool)
+    fresh = [first]
+    while fresh:
+        chosen = np.concatenate([order[ends[i] - pieces.pixels[i] : ends[i]] for i in fresh])
+        tree = cKDTree(points[chosen[:: max(1, len(chosen) // _SAMPLE)]])
+        others = np.flatnonzero(~is_person)
+        if not len(others):
+            break
+        rows = np.concatenate([samples[i] for i in others])
+        nearest = tree.query(points[rows])[0]
+        starts = np.cumsum([0, *(len(samples[i]) for i in others[:-1])])
+        distance[others] = np.minimum(distance[others], np.minimum.reduceat(nearest, starts))
+        is_long = pieces.area_m2 > LONG_M * pieces.thickness_m
+        is_thin = pieces.thickness_m < np.where(is_long, THIN_LONG_M, THIN_M)
+        is_rim = is_thin & (pieces.is_behind > 0.5) & (distance > RIM_M)
+        is_flying = ((pieces.area_m2 < SPECK_M2) | (pieces.pixels <= SPECK_PX)) & (distance > STRAY_M)
+        joins = ~is_person & (distance < NEAR_M) & ~is_rim & ~is_flying
+        fresh = np.flatnonzero(joins).tolist()
+        is_person |= joins
+    depth = np.where(np.append(is_person, False)[pieces.labels], metres, np.float32(0))
+    is_foreign = ~is_person & ~is_rim & ~is_flying
+    return Person(
+        depth,
+        float(pieces.area_m2[is_person].sum()),
+        float(pieces.area_m2[is_foreign].sum()),
+        int(pieces.pixels[is_foreign].sum()),
+        int(pieces.pixels[~is_person & is_rim].sum()),
+        int(pieces.pixels[~is_person & is_flying & ~is_rim].sum()),
+    )
+
+
+@numba.njit(cache=True, nogil=True)
+def _find(parents: np.ndarray, i: int) -> int:
+    while parents[i] != i:
+        parents[i] = parents[parents[i]]
+        i = parents[i]
+    return i
+
+
+@numba.njit(cache=True, nogil=True)
+def _label(metres: np.ndarray, jump: float, share: float) -> tuple[np.ndarray, int]:
+    """Pieces by their numbers, `(H, W)`, and how many; of eight neighbours."""
+    height, width = metres.shape
+    labels = np.full((height, width), -1, np.int32)
+    parents = np.empty(height * width // 2 + 2, np.int32)
+    number = 0
+    for v in range(height):
+        for u in range(width):
+            z = metres[v, u]
+            if z <= 0.0:
+                continue
+            limit = jump + share * z
+            label = -1
+            for dv, du in ((0, -1), (-1, -1), (-1, 0), (-1, 1)):
+                row, column = v + dv, u + du
+                if row < 0 or column < 0 or column >= width:
+                    continue
+                other = labels[row, column]
+                if other >= 0 and abs(metres[row, column] - z) <= limit:
+                    root = _find(parents, other)
+                    if label < 0:
+                        label = root
+                    elif root != label:
+                        low, high = min(root, label), max(root, label)
+                        parents[high] = low
+                        label = low
+            if label < 0:
+                label = number
+                parents[number] = number
+                number += 1
+            labels[v, u] = label
+    names = np.full(number, -1, np.int32)
+    count = 0
+    for i in range(number):
+        if parents[i] == i:
+            names[i] = count
+            count += 1
+    for v in range(height):
+        for u in range(width):
+            if labels[v, u] >= 0:
+                labels[v, u] = names[_find(parents, labels[v, u])]
+    return labels, count
+
+
+@numba.njit(cache=True, nogil=True)
+def _measure(
+    metres: np.ndarray, labels: np.ndarray, number: int, jump: float, share: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Of each piece: pixels, sums of depth and of its square, thickness in pixels, share of the rim that is behind."""
+    height, width = metres.shape
+    pixels, z_sum, area = np.zeros(number, np.int64), np.zeros(number), np.zeros(number)
+    thickness, rim, behind = np.zeros(number), np.zeros(number), np.zeros(number)
+    # Steps to the nearest pixel of another piece or of nothing, by two passes over the eight neighbours.
+    inside = np.zeros((height + 2, width + 2), np.int32)
+    for v in range(height):
+        for u in range(width):
+            label = labels[v, u]
+            if label < 0:
+                continue
+            z = float(metres[v, u])
+            pixels[label] += 1
+            z_sum[label] += z
+            area[label] += z * z
+            nearest = 1 << 20
+            for dv, du in ((0, -1), (-1, -1), (-1, 0), (-1, 1)):
+                row, column = v + dv, u + du
+                is_same = row >= 0 and 0 <= column < width and labels[row, column] == label
+                nearest = min(nearest, inside[row + 1, column + 1] if is_same else 0)
+            inside[v + 1, u + 1] = nearest + 1
+    for v in range(height - 1, -1, -1):
+        for u in range(width - 1, -1, -1):
+            label = labels[v, u]
+            if label < 0:
+                continue
+            nearest = inside[v + 1, u + 1] - 1
+            for dv, du in ((0, 1), (1, -1), (1, 0), (1, 1)):
+                row, column = v + dv, u + du
+                is_same = row < height and 0 <= column < width and labels[row, column] == label
+                nearest = min(nearest, inside[row + 1, column + 1] if is_same else 0)
+                if not is_same and row < height and 0 <= column < width and labels[row, column] >= 0:
+                    other = labels[row, column]
+                    rim[label] += 1
+                    rim[other] += 1
+                    if metres[v, u] > metres[row, column]:
+                        behind[label] += 1
+                    else:
+                        behind[other] += 1
+            inside[v + 1, u + 1] = nearest + 1
+            thickness[label] = max(thickness[label], 2.0 * nearest + 1.0)
+    for label in range(number):
+        if rim[label] > 0:
+            behind[label] /= rim[label]
+    return pixels, z_sum, area, thickness, behind
