@@ -23,6 +23,7 @@ from ljn.benchmark.frames import BenchFrame
 from ljn.body.skeleton import NUM_JOINTS
 from ljn.cloud.lifting import lift_keypoints
 from ljn.pipeline.keypoints import Keypoints, fill_missing
+from ljn.pipeline.person import find_person
 from ljn.pipeline.pipeline import Pipeline
 from ljn.reading import reason
 from ljn.runs.packages import SUFFIX
@@ -133,7 +134,10 @@ class PipelinePredictor:
 
     def _predict(self, frames: Sequence[BenchFrame]) -> tuple[np.ndarray, np.ndarray | None]:
         observed = [
-            self.pipeline.observe_body(frame.depth, frame.camera, _filled(frame.keypoints), frame.num_points)
+            self.pipeline.observe_body(
+                find_person(frame.depth, frame.camera).depth,
+                *(frame.camera, _filled(frame.keypoints), frame.num_points),
+            )
             for frame in frames
         ]
         given = [frame.joints for frame in frames if frame.joints is not None]

@@ -72,9 +72,13 @@ def apply_overrides(cfg: DictConfig, overrides: list[str]) -> None:
             )
 
 
+_OPTIONAL = ("data.sensor",)
+"""Parts of a configuration that a call may leave out: without a sensor's chain, depth has the noise of `gaussian`."""
+
+
 def _set(cfg: DictConfig, key: str, value: Any, line: str) -> None:
     current = OmegaConf.select(cfg, key, default=_MISSING)
-    if isinstance(current, DictConfig):
+    if isinstance(current, DictConfig) and not (key in _OPTIONAL and value is None):
         raise ValueError(
             f"{line}: '{key}' holds several values; change one of them: {', '.join(map(str, current))}"
         )

@@ -1,6 +1,8 @@
 """`task=predict`: joints and meshes of depth images."""
 
+import hashlib
 import logging
+import os
 import sys
 from dataclasses import asdict
 from pathlib import Path
@@ -27,6 +29,8 @@ from ljn.tasks.package import chosen_package
 from ljn.tasks.validation import check_writable
 
 _LOG = logging.getLogger(__name__)
+_SUMMARY = "predictions.json"
+_WRITTEN = (".npz", ".ply", ".glb", ".png")
 _NEEDED = ("task.input", "task.camera")
 _CHECKPOINTS = ("ckpt_path", "task.mesh_ckpt_path")
 _OPTIONAL = ("task.keypoints", "task.mask")
@@ -37,10 +41,11 @@ _COMMAND = (
 
 
 def predict(cfg: DictConfig) -> dict[str, float]:
-    """Predict joints and meshes of a depth image, or of each in a folder, into `output_dir/predictions/NAME`.
+    """Predict joints and meshes of a depth image, or of each in a folder, into `output_dir/predictions/NAME-HASH`.
 
-    A frame of a folder that cannot be predicted is reported, and all others are predicted. `predictions.json` lists
-    each frame's outcome.
+    The hash is that of the input's absolute path, so that `alice/depth` and `bob/depth` have folders of their own; what
+    an earlier call on the same input left there is removed. A frame of a folder that cannot be predicted is reported,
+    and all others are predicted. `predictions.json` lists each frame's outcome.
 
     Args:
         cfg: The composed configuration; of it `task`, `ckpt_path`, `weights`, `refine`, `body.path`, `paths`,
@@ -67,7 +72,7 @@ def predict(cfg: DictConfig) -> dict[str, float]:
             raise ValueError(f"{key}: expected a path, got {got}; {_COMMAND}")
     camera = read_camera(task.camera)
     frames = find_frames(task.input, task.keypoints, task.mask, task.mask_id)
-    directory = Path(cfg.paths.output_dir) / "predictions" / path_part(Path(task.input).stem)
+    directory = _directory(cfg.paths.output_dir, task.input)
     check_writable(directory)
     if cfg.num_threads is not None:
         torch.set_num_threads(cfg.num_threads)
@@ -101,24 +106,31 @@ def predict(cfg: DictConfig) -> dict[str, float]:
         "camera": asdict(camera),
         "frames": results,
     }
-    write_json(directory / "predictions.json", summary)
+    write_json(directory / _SUMMARY, summary)
     _LOG.info("%d of %d frames predicted: %s", len(results) - len(failed), len(results), directory)
     if failed:
         raise ValueError(
             f"task.input: {len(failed)} of {len(results)} frames failed, all others are written; the first is "
-            f"{failed[0]}: {results[failed[0]]['error']} (all of them are in {directory / 'predictions.json'})"
+            f"{failed[0]}: {results[failed[0]]['error']} (all of them are in {directory / _SUMMARY})"
         )
     return metrics
+
+
+def _directory(output_dir: str, input: str) -> Path:
+    """Where the predictions of an input go: a folder that no other input has."""
+    path = Path(input).resolve()
+    name = path.name if path.is_dir() else path.stem
+    digest = hashlib.sha256(os.fsencode(path)).hexdigest()[:6]
+    return Path(output_dir) / "predictions" / f"{path_part(name)}-{digest}"
 
 
 def _predict(
     pipeline: Pipeline, frames: list[FrameFiles], camera: Camera, directory: Path, may_fail: bool
 ) -> dict[str, dict[str, Any]]:
     """Predict and write; returns what became of each frame."""
-    for frame in frames:
-        for suffix in (".npz", ".ply", ".glb", ".png"):
-            # What an earlier call left would pass for this one's.
-            (directory / f"{frame.name}{suffix}").unlink(missing_ok=True)
+    for path in directory.glob("*"):
+        if path.suffix in _WRITTEN or path.name == _SUMMARY:
+            path.unlink()  # of an earlier call; it would pass for this one's
     results: dict[str, dict[str, Any]] = {}
     with tqdm(total=len(frames), unit="frame", disable=None if may_fail else True) as progress:
         for frame, prediction, depth, error in predict_frames(pipeline, frames, camera, FrameFiles.read):

@@ -72,6 +72,8 @@ def test_overrides_change_data_and_nothing_that_the_checkpoint_decides(trained, 
             with_checkpoint_config(cfg, checkpoint, [override])
     with pytest.raises(ValueError, match=r"'data\.source' holds several values"):
         with_checkpoint_config(cfg, checkpoint, ["data.source=null"])
+    checkpoint.config["data"]["sensor"] = {"_target_": "datamodules.sensor.Sensor", "steps": {}}
+    assert with_checkpoint_config(cfg, checkpoint, ["data.sensor=null"]).data.sensor is None
     with pytest.raises(ValueError, match=r"no key 'data\.num_tset'; known there: .*num_test"):
         with_checkpoint_config(cfg, checkpoint, ["data.num_tset=3"])
 
@@ -100,7 +102,7 @@ def test_other_bodies_reach_all_that_was_made_of_the_bodies_group(write_checkpoi
 
 def test_refined_meshes_have_metrics_beside_the_others(smoke_config, tmp_path):
     call = ("task=evaluate", "weights=small", "task.stage=mesh", "data.num_test=8", "data.num_workers=0")
-    typed = ["data.num_test=8", "data.num_workers=0"]
+    typed = ["data.num_test=8", "data.num_workers=0", "data.sensor=null"]
     path = find_package("small", "weights")
     cfg = smoke_config(tmp_path, *call, "refine=true")
     metrics = evaluate_checkpoint(cfg, path, typed, stage="mesh")

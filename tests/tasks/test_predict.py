@@ -16,6 +16,7 @@ from ljn.pipeline.keypoint_orders import ORDERS
 from ljn.render import get_renderer
 from ljn.tasks.predict import predict
 
+output_directory = ljn.tasks.predict._directory
 README = Path(__file__).parents[2] / "README.md"
 
 
@@ -73,7 +74,7 @@ def folders(files, tmp_path):
         for frame in ("a", "b", "c"):
             shutil.copy(files / f"{name}{suffix}", tmp_path / name / f"{frame}{suffix}")
     (tmp_path / "depth" / "b.png").write_bytes((files / "depth.png").read_bytes()[:500])
-    outputs = tmp_path / "predictions" / "depth"
+    outputs = output_directory(tmp_path, tmp_path / "depth")
     outputs.mkdir(parents=True)
     (outputs / "b.npz").write_bytes(b"of an earlier call")
     names = {"input": "depth", "keypoints": "keypoints", "mask": "mask"}
@@ -88,7 +89,7 @@ def test_the_command_predicts_an_image(config, files, checkpoints, run_py, tmp_p
         *(f"ckpt_path={checkpoints[0]}", f"task.mesh_ckpt_path={checkpoints[1]}"),
         f"paths.output_dir={tmp_path}",
     )
-    outputs = tmp_path / "predictions" / "depth"
+    outputs = output_directory(tmp_path, files / "depth.png")
     assert {path.name for path in outputs.iterdir()} == {
         *(f"depth{suffix}" for suffix in (".npz", ".ply", ".glb", ".png")),
         "predictions.json",
@@ -102,11 +103,11 @@ def test_the_command_predicts_an_image(config, files, checkpoints, run_py, tmp_p
 
 
 def test_without_a_mesh_checkpoint_joints_alone_are_written_whatever_the_configurations_model(
-    config, tmp_path
+    config, files, tmp_path
 ):
     broken = ("model.radii_m=[1]", "data.observation.num_points=0")
     assert predict(config("task.mesh_ckpt_path=null", *broken)) == {"predict/frames": 1}
-    outputs = tmp_path / "predictions" / "depth"
+    outputs = output_directory(tmp_path, files / "depth.png")
     assert {path.name for path in outputs.iterdir()} == {"depth.npz", "depth.png", "predictions.json"}
 
 
@@ -143,7 +144,7 @@ def test_what_a_prediction_needs_is_named(key, config):
         predict(config(f"{key}=null"))
 
 
-def test_keypoints_are_needed_where_the_detector_takes_them_alone(config, write_checkpoint, tmp_path):
+def test_keypoints_are_needed_where_the_detector_takes_them_alone(config, files, write_checkpoint, tmp_path):
     with pytest.raises(
         ValueError, match=r"task\.keypoints: expected a path, since the detector .* takes keypoints"
     ):
@@ -152,7 +153,7 @@ def test_keypoints_are_needed_where_the_detector_takes_them_alone(config, write_
     mesh = write_checkpoint("mesh/kinematic", "model.channels=16")
     changes = ("task.keypoints=null", f"ckpt_path={detector}", f"task.mesh_ckpt_path={mesh}")
     assert predict(config(*changes))["predict/frames"] == 1
-    with np.load(tmp_path / "predictions" / "depth" / "depth.npz") as arrays:
+    with np.load(output_directory(tmp_path, files / "depth.png") / "depth.npz") as arrays:
         assert {"joints", "vertices", "points"} <= set(arrays) - {
             "keypoints",
             "initial_joints",
@@ -237,3 +238,21 @@ def test_the_readme_s_example_runs(files, kinect, monkeypatch, tmp_path):
     prediction = names["prediction"]
     shapes = (prediction.joints.shape, prediction.vertices.shape, prediction.pose.shape)
     assert shapes == ((24, 3), (6890, 3), (72,))
+
+
+def test_inputs_of_one_name_have_folders_of_their_own_and_nothing_of_an_earlier_call(
+    folders, config, files, tmp_path
+):
+    changes, outputs = folders
+    places = [tmp_path / person / "depth" for person in ("alice", "bob")]
+    for place in places:
+        place.mkdir(parents=True)
+    directories = {output_directory(tmp_path, place) for place in (*places, tmp_path / "depth")}
+    assert len(directories) == 3
+    assert {path.name.rpartition("-")[0] for path in directories} == {"depth"}
+    assert output_directory(tmp_path, tmp_path / "alice" / ".." / "depth") == outputs
+    (tmp_path / "depth" / "b.png").unlink()
+    (outputs / "of_a_frame_that_is_gone.glb").write_bytes(b"")
+    predict(config(*changes))
+    assert not list(outputs.glob("b.*")) + list(outputs.glob("of_a_frame*"))
+    assert len(list(outputs.glob("*.npz"))) == 2
