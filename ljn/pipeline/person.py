@@ -13,11 +13,11 @@ JUMP_M, JUMP_SHARE = 0.05, 0.02
 belong to different pieces."""
 NEAR_M = 0.8
 """A piece this near to the person belongs to it: a limb before or behind the trunk."""
-RIM_M, THIN_M, THIN_LONG_M, LONG_M = 0.25, 0.03, 0.06, 0.6
-"""A rim of the background, left by a mask too wide: a piece behind what is beside it, farther than the first from the
-person, and nowhere thicker than the second, or than the third where it is longer than the fourth."""
-SPECK_M2, SPECK_PX, STRAY_M = 0.0005, 3, 0.2
-"""A piece smaller than one of the first two and farther than the third from the person is a flying pixel.
+RIM_M, THIN_M, LONG_M = 0.25, 0.12, 1.0
+"""A rim of the background, left by a mask too wide: pieces behind what is beside them, farther than the first from the
+person, nowhere thicker than the second, and together longer than the third."""
+SPECK_M2, STRAY_M = 0.0005, 0.2
+"""A piece smaller than the first and farther than the second from the person is a flying pixel.
 
 All of these are chosen so that rendered bodies, behind any sensor, lose nothing that a detector would miss."""
 _SAMPLE, _OF_PIECE = 1500, 12
@@ -110,10 +110,9 @@ def find_person(metres: np.ndarray, camera: Camera, is_seed: np.ndarray | None =
         nearest = tree.query(points[rows])[0]
         starts = np.cumsum([0, *(len(samples[i]) for i in others[:-1])])
         distance[others] = np.minimum(distance[others], np.minimum.reduceat(nearest, starts))
-        is_long = pieces.area_m2 > LONG_M * pieces.thickness_m
-        is_thin = pieces.thickness_m < np.where(is_long, THIN_LONG_M, THIN_M)
-        is_rim = is_thin & (pieces.is_behind > 0.5) & (distance > RIM_M)
-        is_flying = ((pieces.area_m2 < SPECK_M2) | (pieces.pixels <= SPECK_PX)) & (distance > STRAY_M)
+        is_rim = ~is_person & (pieces.thickness_m < THIN_M) & (pieces.is_behind > 0.5) & (distance > RIM_M)
+        is_rim &= (pieces.area_m2 / pieces.thickness_m)[is_rim].sum() > LONG_M
+        is_flying = (pieces.area_m2 < SPECK_M2) & (distance > STRAY_M)
         joins = ~is_person & (distance < NEAR_M) & ~is_rim & ~is_flying
         fresh = np.flatnonzero(joins).tolist()
         is_person |= joins
