@@ -1,25 +1,30 @@
 """How often right inputs are refused or doubted, and wrong ones found.
 
 python -m tests.benchmarks.input_checks --keypoints [--samples 2000]
+python -m tests.benchmarks.input_checks --depth [--samples 2000]
 
 Samples are embedded test poses of all families, seen from all sides by all sensors.
 """
 
 import argparse
 
-from tests.benchmarks import keypoint_checks
+from tests.benchmarks import depth_checks, keypoint_checks
 
 
 def main() -> None:
     """Print the tables that are asked for."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0] if __doc__ else None)
     parser.add_argument("--keypoints", action="store_true", help="2D keypoints held against the body")
+    parser.add_argument("--depth", action="store_true", help="the person found in a depth image")
     parser.add_argument("--samples", type=int, default=2000)
     parser.add_argument("--split", default="test", help="train, where thresholds are chosen, or test")
     arguments = parser.parse_args()
-    if not arguments.keypoints:
-        parser.error("say what to measure: --keypoints")
-    keypoint_checks.measure(arguments.samples, arguments.split)
+    if not (arguments.keypoints or arguments.depth):
+        parser.error("say what to measure: --keypoints, --depth")
+    if arguments.keypoints:
+        keypoint_checks.measure(arguments.samples, arguments.split)
+    if arguments.depth:
+        depth_checks.measure(arguments.samples, arguments.split)
 
 
 if __name__ == "__main__":
