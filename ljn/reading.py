@@ -5,6 +5,7 @@ import json
 import math
 import pickle
 import pickletools
+import re
 import reprlib
 import struct
 import tokenize
@@ -70,7 +71,8 @@ def read_json(path: Path) -> Any:
 
 def read_yaml(path: Path) -> Any:
     """The content of a small YAML file without code and without repeated lists or mappings; raises `READ_ERRORS`."""
-    return yaml.load(_text(path, _MAX_YAML_BYTES), _PlainLoader)
+    # OpenCV begins its files with "%YAML:1.0", which is no YAML.
+    return yaml.load(re.sub(r"^%YAML:[0-9.]+", "", _text(path, _MAX_YAML_BYTES)), _PlainLoader)
 
 
 class _PlainLoader(yaml.SafeLoader):
@@ -83,10 +85,17 @@ class _PlainLoader(yaml.SafeLoader):
         return super().compose_node(parent, index)
 
 
+_PlainLoader.add_constructor(
+    "tag:yaml.org,2002:opencv-matrix", lambda loader, node: loader.construct_mapping(node, deep=True)
+)
+
+
 def _text(path: Path, max_bytes: int) -> str:
     if (size := path.stat().st_size) > max_bytes:
         raise ValueError(f"{size} bytes, expected at most {max_bytes}")
-    return path.read_text(encoding="utf-8")
+    return path.read_text(
+        encoding="utf-8-sig"
+    )  # with a byte-order mark, as some editors write it, or without
 
 
 def read_arrays(path: Path, keys: Collection[str] | None = None) -> dict[str, np.ndarray]:

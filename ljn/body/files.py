@@ -143,7 +143,25 @@ def load_body_model(path: str | Path | None = None, gender: str = "neutral") -> 
         raise ValueError(
             f"{path}: cannot be read ({reason(error)}): damaged, or no SMPL model. Fetch it again."
         ) from error
-    return _assemble(arrays, gender, path)
+    body = _assemble(arrays, gender, path)
+    _check_rest_pose(body)
+    return body
+
+
+def _check_rest_pose(body: BodyModel) -> None:
+    """Raise a `ValueError` for a body in another unit than metres, or one whose rest pose does not stand along y."""
+    across, up, forward = np.ptp(body.v_template, axis=0).tolist()
+    shown = f"{across:.2f} x {up:.2f} x {forward:.2f} (x, y, z)"
+    if not 0.2 < max(across, up, forward) < 10:
+        raise body._error(
+            f"v_template should be in metres, but measures {shown}: centimetres or millimetres? Divide v_template, "
+            "shapedirs and posedirs by 100 or 1000"
+        )
+    if forward > 2 * up:
+        raise body._error(
+            f"v_template should stand along y, facing z, but measures {shown}: z up? Turn v_template, shapedirs and "
+            "posedirs by -90 degrees about x"
+        )
 
 
 def load_body_models(path: str | Path | None, genders: Sequence[str]) -> tuple[BodyModel, ...]:

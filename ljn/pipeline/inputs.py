@@ -66,14 +66,17 @@ def read_mask(path: str | Path, chosen: int | None = None) -> np.ndarray:
 
 
 def read_camera(path: str | Path) -> Camera:
-    """A camera from YAML or JSON with fx, fy, cx, cy, width and height, pixels; pixel centres at integers.
+    """A camera from YAML or JSON, pixels; pixel centres at integers.
 
-    Cameras here have no distortion: undistort images first. Keys that begin with `_` are passed over, so the files in
-    `conf/data/camera` can be read.
+    Forms: fx, fy, cx, cy, width and height; ROS's `camera_info` and OpenCV's calibration files (`camera_matrix`, image
+    width and height); Open3D's (`intrinsic_matrix`, column by column); RealSense's (`ppx`, `ppy`). Keys that begin with
+    `_` are passed over, so the files in `conf/data/camera` can be read. Cameras here have no distortion: coefficients
+    that are not all 0 are an error.
 
     Raises:
         FileNotFoundError: There is no such file.
-        ValueError: It cannot be read, keys are missing or unknown, or a value is not what its key needs.
+        ValueError: It cannot be read, keys are missing or unknown, a value is not what its key needs, or images of the
+            camera are distorted.
     """
     path = _existing(path, "camera")
     try:
@@ -84,6 +87,7 @@ def read_camera(path: str | Path) -> Camera:
     if not isinstance(content, dict):
         raise ValueError(f"{expected}, got {shown(content)}")
     values = {str(key): value for key, value in content.items() if not str(key).startswith("_")}
+    values = _of_other_forms(values, path)
     if missing := [key for key in _CAMERA_KEYS if key not in values]:
         raise ValueError(f"{expected}: {', '.join(missing)} are missing")
     if unknown := sorted(values.keys() - set(_CAMERA_KEYS)):
@@ -96,6 +100,73 @@ def read_camera(path: str | Path) -> Camera:
                 f"camera: {key}: expected a whole number of pixels in '{path}', got {size:g}; give the image's own size"
             )
     return Camera(fx, fy, cx, cy, int(width), int(height))
+
+
+_MATRICES = ("camera_matrix", "K", "k", "intrinsic_matrix")
+_DISTORTIONS = ("distortion_coefficients", "distortion", "dist_coeffs", "D", "d", "coeffs")
+_RENAMED = {"ppx": "cx", "ppy": "cy", "image_width": "width", "image_height": "height"}
+_PASSED_OVER = (
+    *(
+        "header",
+        "camera_name",
+        "distortion_model",
+        "model",
+        "rectification_matrix",
+        "projection_matrix",
+        "R",
+        "P",
+    ),
+    *(
+        "binning_x",
+        "binning_y",
+        "roi",
+        "calibration_time",
+        "board_width",
+        "board_height",
+        "square_size",
+        "flags",
+    ),
+    *("avg_reprojection_error", "nframes", "r", "p"),
+)
+
+
+def _of_other_forms(values: dict[str, Any], path: Path) -> dict[str, Any]:
+    """The six keys' values from those of ROS, OpenCV, Open3D and RealSense, if it is one of theirs."""
+    matrix = next((key for key in _MATRICES if key in values), None)
+    if matrix is None and "ppx" not in values:
+        return values
+    values = {_RENAMED.get(key, key): value for key, value in values.items() if key not in _PASSED_OVER}
+    for key in _DISTORTIONS:
+        if key in values and any(_numbers_of(values.pop(key), f"{key} in '{path}'")):
+            raise ValueError(
+                f"camera: '{path}' has {key} that are not 0, and cameras here have no distortion: undistort the images "
+                "(cv2.undistort), and set them to 0"
+            )
+    if matrix is not None:
+        numbers = _numbers_of(values.pop(matrix), f"{matrix} in '{path}'")
+        if len(numbers) != 9:
+            raise ValueError(f"camera: {matrix}: expected 9 numbers in '{path}', got {len(numbers)}")
+        rows = np.reshape(numbers, (3, 3))
+        if matrix == "intrinsic_matrix":  # Open3D writes it column by column
+            rows = rows.T
+        if not np.array_equal(rows[2], [0, 0, 1]):
+            raise ValueError(
+                f"camera: {matrix}: expected the last row 0, 0, 1 in '{path}', got {rows[2].tolist()}; Open3D's "
+                "intrinsic_matrix goes column by column, all others row by row"
+            )
+        found = {"fx": rows[0, 0], "fy": rows[1, 1], "cx": rows[0, 2], "cy": rows[1, 2]}
+        values |= {name: float(value) for name, value in found.items()}
+    return values
+
+
+def _numbers_of(value: Any, name: str) -> list[float]:
+    """The numbers of a list, a list of lists, or a mapping with them as `data`."""
+    if isinstance(value, dict):
+        value = value.get("data")
+    try:
+        return np.asarray(value, np.float64).ravel().tolist()
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"camera: expected numbers as {name}, got {shown(value)}") from error
 
 
 def read_keypoints(path: str | Path) -> Any:

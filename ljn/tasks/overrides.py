@@ -17,6 +17,7 @@ _OF_BODY = {
     "body.predicted": ("module.predicted",),
 }
 _MISSING = object()
+_SENSOR = "data/sensor="
 
 
 def typed_overrides() -> list[str]:
@@ -27,7 +28,8 @@ def typed_overrides() -> list[str]:
 def with_checkpoint_config(cfg: DictConfig, checkpoint: Checkpoint, overrides: list[str]) -> DictConfig:
     """The call's configuration with the checkpoint's model, data and trainer, and the overrides on top.
 
-    Of the checkpoint's groups, the keys that `ljn.runs.keys` gives to the machine or the call have this call's values.
+    Of the checkpoint's groups, the keys that `ljn.runs.keys` gives to the machine or the call have this call's values;
+    and with `data/sensor=NAME` the data has that chain of steps, its cameras as they are.
 
     Raises:
         ValueError: An override is about something that the checkpoint decides.
@@ -36,7 +38,10 @@ def with_checkpoint_config(cfg: DictConfig, checkpoint: Checkpoint, overrides: l
     plain |= {name: _with_call(checkpoint.config[name], plain[name], name) for name in CONFIG_GROUPS}
     merged = OmegaConf.create(plain)
     OmegaConf.set_struct(merged, True)
-    apply_overrides(merged, overrides)
+    single = [line for line in overrides if not line.startswith(_SENSOR)]
+    if len(single) < len(overrides):
+        OmegaConf.update(merged, "data.sensor", cfg.data.sensor, force_add=True)
+    apply_overrides(merged, single)
     return merged
 
 
@@ -72,13 +77,9 @@ def apply_overrides(cfg: DictConfig, overrides: list[str]) -> None:
             )
 
 
-_OPTIONAL = ("data.sensor",)
-"""Parts of a configuration that a call may leave out: without a sensor's chain, depth has the noise of `gaussian`."""
-
-
 def _set(cfg: DictConfig, key: str, value: Any, line: str) -> None:
     current = OmegaConf.select(cfg, key, default=_MISSING)
-    if isinstance(current, DictConfig) and not (key in _OPTIONAL and value is None):
+    if isinstance(current, DictConfig):
         raise ValueError(
             f"{line}: '{key}' holds several values; change one of them: {', '.join(map(str, current))}"
         )

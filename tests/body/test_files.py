@@ -488,3 +488,18 @@ def test_bad_files_of_bodies_are_named(tmp_path):
         load_body_models(tmp_path, ["male"])
     with pytest.raises(ValueError, match="expected one of female, male, neutral, got 'child'"):
         load_body_models(None, ["child"])
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda v: 100 * v, "should be in metres.*centimetres or millimetres"),
+        (lambda v: 1000 * v, "should be in metres"),
+        (lambda v: v[:, [0, 2, 1]] * [1, -1, 1], "should stand along y.*z up"),
+    ],
+)
+def test_a_body_in_another_unit_or_with_z_up_is_refused(change, message, tmp_path):
+    fields = embedded_fields()
+    np.savez(tmp_path / "body.npz", **{**fields, "v_template": change(fields["v_template"].astype(float))})
+    with pytest.raises(ValueError, match=message):
+        load_body_model(tmp_path / "body.npz")

@@ -79,6 +79,59 @@ def test_cameras_are_read_from_yaml_and_json(tmp_path):
     assert read_camera(tmp_path / "camera.yaml") == CAMERA
 
 
+FOREIGN_CAMERAS = {
+    "ros.yaml": """
+image_width: 24
+image_height: 20
+camera_name: depth
+camera_matrix: {rows: 3, cols: 3, data: [100.5, 0.0, 10.0, 0.0, 101.0, 9.0, 0.0, 0.0, 1.0]}
+distortion_model: plumb_bob
+distortion_coefficients: {rows: 1, cols: 5, data: [0.0, 0.0, 0.0, 0.0, 0.0]}
+""",
+    "opencv.yml": """%YAML:1.0
+---
+image_width: 24
+image_height: 20
+camera_matrix: !!opencv-matrix
+   rows: 3
+   cols: 3
+   dt: d
+   data: [ 100.5, 0., 10., 0., 101., 9., 0., 0., 1. ]
+distortion_coefficients: !!opencv-matrix
+   rows: 5
+   cols: 1
+   dt: d
+   data: [ 0., 0., 0., 0., 0. ]
+""",
+    "open3d.json": """{"width": 24, "height": 20, "intrinsic_matrix": [100.5, 0, 0, 0, 101.0, 0, 10.0, 9.0, 1]}""",
+    "realsense.json": """{"width": 24, "height": 20, "ppx": 10.0, "ppy": 9.0, "fx": 100.5, "fy": 101.0,
+        "model": "distortion.brown_conrady", "coeffs": [0, 0, 0, 0, 0]}""",
+    "marked.json": "\ufeff" + json.dumps(vars(CAMERA)),
+}
+
+
+@pytest.mark.parametrize("name", FOREIGN_CAMERAS)
+def test_cameras_of_other_programs_are_read(name, tmp_path):
+    (tmp_path / name).write_text(FOREIGN_CAMERAS[name], encoding="utf-8")
+    assert read_camera(tmp_path / name) == CAMERA
+
+
+@pytest.mark.parametrize("name", ["ros.yaml", "opencv.yml", "realsense.json"])
+def test_a_camera_with_distortion_is_refused(name, tmp_path):
+    text = FOREIGN_CAMERAS[name]
+    place = text.rfind("[") + 1  # of the coefficients
+    (tmp_path / name).write_text(f"{text[:place]}0.09, {text[place:]}")
+    with pytest.raises(ValueError, match=r"that are not 0.*undistort the images"):
+        read_camera(tmp_path / name)
+
+
+def test_a_matrix_of_open3d_row_by_row_is_refused(tmp_path):
+    matrix = [100.5, 0, 10.0, 0, 101.0, 9.0, 0, 0, 1]
+    (tmp_path / "camera.json").write_text(json.dumps({"width": 24, "height": 20, "intrinsic_matrix": matrix}))
+    with pytest.raises(ValueError, match="column by column"):
+        read_camera(tmp_path / "camera.json")
+
+
 def test_a_camera_s_numbers_may_be_written_in_any_way(tmp_path):
     (tmp_path / "camera.json").write_text(
         '{"fx": 1.005e2, "fy": 101, "cx": "10", "cy": 9, "width": 24.0, "height": 20}'

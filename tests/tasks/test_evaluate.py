@@ -72,10 +72,21 @@ def test_overrides_change_data_and_nothing_that_the_checkpoint_decides(trained, 
             with_checkpoint_config(cfg, checkpoint, [override])
     with pytest.raises(ValueError, match=r"'data\.source' holds several values"):
         with_checkpoint_config(cfg, checkpoint, ["data.source=null"])
-    checkpoint.config["data"]["sensor"] = {"_target_": "datamodules.sensor.Sensor", "steps": {}}
-    assert with_checkpoint_config(cfg, checkpoint, ["data.sensor=null"]).data.sensor is None
     with pytest.raises(ValueError, match=r"no key 'data\.num_tset'; known there: .*num_test"):
         with_checkpoint_config(cfg, checkpoint, ["data.num_tset=3"])
+
+
+def test_a_sensor_is_chosen_as_a_whole_and_then_changed(trained, smoke_config, tmp_path):
+    checkpoint = read_checkpoint(trained[1] / "checkpoints" / "best.ckpt")
+    typed = ["data/sensor=kinect_v2", "data.sensor.strength=0.5"]
+    merged = with_checkpoint_config(
+        evaluation(smoke_config, trained, tmp_path, *typed[:1]), checkpoint, typed
+    )
+    assert merged.data.sensor.strength == 0.5
+    assert "multipath" in merged.data.sensor.steps
+    assert merged.data.synthesis == checkpoint.config["data"]["synthesis"]
+    cfg = evaluation(smoke_config, trained, tmp_path)
+    assert with_checkpoint_config(cfg, checkpoint, ["data/sensor=gaussian"]).data.sensor is None
 
 
 def test_an_evaluation_has_this_machines_values_and_the_checkpoints_keys(
@@ -102,7 +113,7 @@ def test_other_bodies_reach_all_that_was_made_of_the_bodies_group(write_checkpoi
 
 def test_refined_meshes_have_metrics_beside_the_others(smoke_config, tmp_path):
     call = ("task=evaluate", "weights=small", "task.stage=mesh", "data.num_test=8", "data.num_workers=0")
-    typed = ["data.num_test=8", "data.num_workers=0", "data.sensor=null"]
+    typed = ["data.num_test=8", "data.num_workers=0", "data.sensor.strength=0"]
     path = find_package("small", "weights")
     cfg = smoke_config(tmp_path, *call, "refine=true")
     metrics = evaluate_checkpoint(cfg, path, typed, stage="mesh")
