@@ -16,6 +16,8 @@ AREA_M2 = (0.07, 1.0)
 less than the first or more than the second is none. `python -m tests.benchmarks.input_checks` measures it."""
 DOUBTFUL_M2 = (0.15, 0.85)
 """Outside of these it may be one: a child, somebody half hidden, or two people."""
+APART_M2 = 0.15
+"""A piece of more than this that lies apart from the rest may be somebody else."""
 _SPAN_M = (0.4, 2.9)  # of the longest side: from a crouching child to a tall man who reaches up
 _MUCH = 0.2
 """What is dropped is worth a warning from this share of the person's pixels on."""
@@ -71,6 +73,11 @@ def body_depth(depth: Any, camera: Camera, mask: Any = None, report: Report | No
     )
     num_dropped = person.num_foreign + person.num_rim + person.num_flying
     _check_size(person.depth, person.area_m2, camera, mask is not None, report)
+    if person.apart_m2 > APART_M2:
+        report.doubt(
+            f"depth: a piece of {person.apart_m2:.2f} square metres lies apart from the rest: somebody else? Give a "
+            "mask of the person alone"
+        )
     if num_dropped > _MUCH * num_pixels:
         report.doubt(
             f"depth: {num_dropped} pixels beside the person's {num_pixels} were dropped, {person.num_foreign} of them "
@@ -148,15 +155,20 @@ def _check_shape(name: str, image: np.ndarray, camera: Camera) -> None:
 
 
 def _check_principal_point(camera: Camera, report: Report) -> None:
-    """Doubt a principal point that would fit well with its coordinates swapped, and fits badly as it is."""
+    """Refuse a principal point whose coordinates are swapped, or of a larger image; doubt one far from the middle."""
     size = np.array([camera.width, camera.height])
     middle, given = (size - 1) / 2, np.array([camera.cx, camera.cy])
     as_given, swapped = (np.abs(point - middle) / size for point in (given, given[::-1]))
-    if as_given.max() > 0.08 and swapped.max() < 0.04:
-        report.doubt(
-            f"camera: cx = {camera.cx:g} and cy = {camera.cy:g} lie far from the middle of an image of {camera.width} "
-            f"x {camera.height} (width x height) pixels, and would lie near it if they were swapped; are they?"
+    shown = f"camera: cx = {camera.cx:g} and cy = {camera.cy:g} lie far from the middle of an image of {camera.width} "
+    shown += f"x {camera.height} (width x height) pixels"
+    if as_given.min() > 0.05 and swapped.max() < 0.025:
+        raise ValueError(f"{shown}, and would lie in it if they were swapped: swap them")
+    if as_given.min() > 0.4:
+        raise ValueError(
+            f"{shown}: is the camera that of a larger image? Scale fx, fy, cx and cy with the image"
         )
+    if as_given.max() > 0.25:
+        report.doubt(f"{shown}: is the camera that of this image, and not of a larger one?")
 
 
 def _is_measured(depth: np.ndarray) -> np.ndarray:

@@ -13,6 +13,8 @@ JUMP_M, JUMP_SHARE = 0.05, 0.02
 belong to different pieces."""
 NEAR_M = 0.8
 """A piece this near to the person belongs to it: a limb before or behind the trunk."""
+APART_M = 0.2
+"""No gap is so wide between the parts of a person whom nothing hides."""
 RIM_M, THIN_M, LONG_M = 0.25, 0.12, 1.0
 """A rim of the background, left by a mask too wide: pieces behind what is beside them, farther than the first from the
 person, nowhere thicker than the second, and together longer than the third."""
@@ -57,6 +59,7 @@ class Person(NamedTuple):
     Attributes:
         depth: `(H, W)` float32, metres; 0 is background.
         area_m2: Its area, seen across the line of sight.
+        apart_m2: Area of the largest piece of it that is apart from the rest by more than `APART_M`; 0 without one.
         foreign_m2: Area of what is too far from it in space to be a part.
         num_foreign: Pixels of that.
         num_rim: Pixels of a rim of the background, left by a mask too wide.
@@ -65,6 +68,7 @@ class Person(NamedTuple):
 
     depth: np.ndarray
     area_m2: float
+    apart_m2: float
     foreign_m2: float
     num_foreign: int
     num_rim: int
@@ -121,6 +125,7 @@ def find_person(metres: np.ndarray, camera: Camera, is_seed: np.ndarray | None =
     return Person(
         depth,
         float(pieces.area_m2[is_person].sum()),
+        float(pieces.area_m2[is_person & np.isfinite(distance) & (distance > APART_M)].max(initial=0)),
         float(pieces.area_m2[is_foreign].sum()),
         int(pieces.pixels[is_foreign].sum()),
         int(pieces.pixels[~is_person & is_rim].sum()),

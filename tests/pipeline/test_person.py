@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -120,12 +122,24 @@ def test_a_body_of_half_the_size_is_doubted_and_one_of_a_third_refused(person):
         body_depth(person, Camera(1081.0, 1081.0, CAMERA.cx, CAMERA.cy, 424, 512))
 
 
-def test_a_principal_point_with_its_coordinates_swapped_is_doubted(person):
-    report = Report()
-    body_depth(person, Camera(CAMERA.fx, CAMERA.fy, 253.0, 206.5, 424, 512), None, report)
-    assert "if they were swapped" in report.warnings[0]
+def test_a_principal_point_is_that_of_the_image(person):
+    with pytest.raises(ValueError, match="if they were swapped"):
+        body_depth(person, replace(CAMERA, cx=253.0, cy=206.5))
+    half = np.ascontiguousarray(person[::2, ::2])
+    with pytest.raises(ValueError, match="that of a larger image"):
+        body_depth(half, replace(CAMERA, width=212, height=256))
+    body_depth(person, replace(CAMERA, cx=90.0), None, report := Report())
+    assert "far from the middle" in report.warnings[0]
     body_depth(person, CAMERA, None, report := Report())
     assert not report.warnings
+
+
+def test_a_second_person_is_doubted(person):
+    aside = np.roll(np.where(person > 0, person + np.float32(0.6), 0), -150, 1)
+    aside[270:] = 0  # behind a table
+    report = Report()
+    body_depth(np.where(person > 0, person, aside), CAMERA, None, report)
+    assert "somebody else" in " ".join(report.warnings)
 
 
 def test_masks_as_people_have_them(person):

@@ -81,13 +81,13 @@ def test_any_smpl_layer_gives_the_same_vertices_in_the_camera_frame(pipeline, gi
 
 
 def test_a_doubt_is_logged_and_reported_and_with_strict_an_error(stages, given, kinect, caplog):
-    swapped = replace(kinect, cx=253.0, cy=206.5)
-    found = Pipeline(*stages)(given[0], swapped, given[1])
-    assert "if they were swapped" in found.report.warnings[0]
-    assert "if they were swapped" in caplog.text
+    aside = replace(kinect, cx=60.0)
+    found = Pipeline(*stages)(given[0], aside, given[1])
+    assert "far from the middle" in found.report.warnings[0]
+    assert "far from the middle" in caplog.text
     assert found.report.facts["pixels"] > 1000
-    with pytest.raises(ValueError, match=r"if they were swapped.*strict=true"):
-        Pipeline(*stages, strict=True)(given[0], swapped, given[1])
+    with pytest.raises(ValueError, match=r"far from the middle.*strict=true"):
+        Pipeline(*stages, strict=True)(given[0], aside, given[1])
 
 
 def test_a_batch_gives_what_its_images_give_alone(pipeline, samples, kinect):
