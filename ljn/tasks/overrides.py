@@ -40,7 +40,7 @@ def with_checkpoint_config(cfg: DictConfig, checkpoint: Checkpoint, overrides: l
     OmegaConf.set_struct(merged, True)
     single = [line for line in overrides if not line.startswith(_SENSOR)]
     if len(single) < len(overrides):
-        OmegaConf.update(merged, "data.sensor", cfg.data.sensor, force_add=True)
+        OmegaConf.update(merged, "data.sensor", cfg.data.sensor, merge=False, force_add=True)
     apply_overrides(merged, single)
     return merged
 

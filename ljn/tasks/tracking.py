@@ -1,5 +1,6 @@
 """Trackers: what is logged once of a run, the run's end, and a sweep's table."""
 
+import logging
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -11,6 +12,10 @@ from hydra.utils import get_class
 from lightning.pytorch.loggers import WandbLogger
 
 from ljn.runs.identity import config_hash
+
+_LOG = logging.getLogger(__name__)
+_PATIENCE_S = 20.0
+"""How long W&B's server is waited for."""
 
 
 @contextmanager
@@ -37,6 +42,7 @@ def tracking(
         for logger in loggers:
             logger._wandb_init.update(about)
             logger._wandb_init.pop("anonymous", None)  # of no effect, and W&B warns of it
+            _start(logger)
             for metric, summary in summaries(config).items():
                 logger.experiment.define_metric(metric, step_metric="trainer/global_step", summary=summary)
         for each in trainer.loggers:
@@ -48,6 +54,27 @@ def tracking(
             import wandb
 
             wandb.finish(exit_code=exit_code)
+
+
+def _start(logger: WandbLogger) -> None:
+    """Begin W&B's run; offline where its server cannot be reached, so that nothing waits for a network."""
+    import wandb
+
+    if logger._offline:
+        return
+    settings = wandb.Settings(init_timeout=_PATIENCE_S)
+    logger._wandb_init["settings"] = settings
+    try:
+        _ = logger.experiment
+    except (wandb.errors.CommError, wandb.errors.UsageError) as error:
+        _LOG.warning(
+            "W&B cannot be reached (%s): the run is kept offline; `wandb sync` uploads what is in %s later",
+            str(error).partition("\n")[0],
+            logger.save_dir,
+        )
+        wandb.teardown()  # W&B's own process still holds the run
+        logger._offline = True
+        logger._wandb_init |= {"mode": "offline", "settings": wandb.Settings()}
 
 
 def summaries(config: Mapping[str, Any]) -> dict[str, str]:

@@ -78,12 +78,15 @@ def test_overrides_change_data_and_nothing_that_the_checkpoint_decides(trained, 
 
 def test_a_sensor_is_chosen_as_a_whole_and_then_changed(trained, smoke_config, tmp_path):
     checkpoint = read_checkpoint(trained[1] / "checkpoints" / "best.ckpt")
+    steps = {"holes": {"_target_": "datamodules.sensor.Holes", "share": 1.0}}
+    checkpoint.config["data"]["sensor"] = {"_target_": "datamodules.sensor.Sensor", "steps": steps}
     typed = ["data/sensor=kinect_v2", "data.sensor.strength=0.5"]
     merged = with_checkpoint_config(
         evaluation(smoke_config, trained, tmp_path, *typed[:1]), checkpoint, typed
     )
     assert merged.data.sensor.strength == 0.5
     assert "multipath" in merged.data.sensor.steps
+    assert "holes" not in merged.data.sensor.steps
     assert merged.data.synthesis == checkpoint.config["data"]["synthesis"]
     cfg = evaluation(smoke_config, trained, tmp_path)
     assert with_checkpoint_config(cfg, checkpoint, ["data/sensor=gaussian"]).data.sensor is None

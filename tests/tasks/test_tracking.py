@@ -6,8 +6,11 @@ import time
 from pathlib import Path
 
 import pytest
+import wandb
+from lightning.pytorch.loggers import WandbLogger
 from omegaconf import OmegaConf
 
+import ljn.tasks.tracking as tracking_module
 from ljn.tasks.evaluate import evaluate
 from ljn.tasks.tracking import log_table, summaries
 from ljn.tasks.train import train
@@ -157,3 +160,20 @@ def test_tensorboard_follows_a_run(smoke_config, tmp_path):
     read = events.EventAccumulator(str(directory)).Reload()
     assert len(read.Scalars("train/loss")) == 2
     assert read.Scalars("test/mpjpe")[0].value == pytest.approx(metrics["test/mpjpe"])
+
+
+def test_a_run_is_kept_offline_where_the_server_cannot_be_reached(tmp_path, monkeypatch, caplog):
+    monkeypatch.setenv("WANDB_BASE_URL", "http://127.0.0.1:9")  # where nobody listens
+    monkeypatch.setenv("WANDB_API_KEY", 40 * "a")
+    monkeypatch.setattr(tracking_module, "_PATIENCE_S", 1.0)
+    monkeypatch.delenv("WANDB_MODE", raising=False)
+    wandb.teardown()  # what it has read of the environment before
+    logger = WandbLogger(save_dir=tmp_path, project="ljn", offline=False)
+    try:
+        tracking_module._start(logger)
+        logger.log_metrics({"train/loss": 1.0})
+    finally:
+        wandb.finish()
+        wandb.teardown()
+    assert "kept offline; `wandb sync` uploads" in caplog.text
+    assert list(tmp_path.glob("wandb/offline-run-*"))
