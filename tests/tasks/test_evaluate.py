@@ -15,6 +15,7 @@ def evaluation(smoke_config, trained, tmp_path, *overrides, ckpt_path=None):
     return smoke_config(tmp_path, "task=evaluate", f"ckpt_path={ckpt_path or checkpoint}", *overrides)
 
 
+@pytest.mark.slow
 def test_several_checkpoints_go_in_one_multirun_and_other_workers_give_exactly_the_metrics_of_training(
     trained, run_py, tmp_path
 ):
