@@ -59,8 +59,9 @@ def read_mask(path: str | Path, chosen: int | None = None) -> np.ndarray:
         ValueError: It cannot be read, or is no mask of one person.
     """
     path = _existing(path, "mask")
+    image = _read_png(path, "mask", (*_GREY, "P", "LA", "RGBA"))
     try:
-        return person_mask(_read_png(path, "mask", (*_GREY, "P", "LA", "RGBA")), chosen)
+        return person_mask(image, chosen)
     except ValueError as error:
         raise ValueError(f"{error} ('{path}')") from error
 

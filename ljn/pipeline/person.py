@@ -32,7 +32,6 @@ class Pieces(NamedTuple):
         labels: `(H, W)` int32, the piece of each pixel from 0; -1 where nothing is measured.
         area_m2: `(P,)`, seen area across the line of sight, square metres.
         pixels: `(P,)`, number of pixels.
-        depth_m: `(P,)`, mean depth.
         thickness_m: `(P,)`, the greatest thickness in the image, at its depth.
         is_behind: `(P,)`, share of the pixels at its rim, beside other pieces, that are behind those.
     """
@@ -40,7 +39,6 @@ class Pieces(NamedTuple):
     labels: np.ndarray
     area_m2: np.ndarray
     pixels: np.ndarray
-    depth_m: np.ndarray
     thickness_m: np.ndarray
     is_behind: np.ndarray
 
@@ -48,9 +46,8 @@ class Pieces(NamedTuple):
 def pieces_of(metres: np.ndarray, camera: Camera) -> Pieces:
     """The pieces of a depth image `(H, W)` float32, metres; 0 is nothing."""
     labels, number = _label(metres, JUMP_M, JUMP_SHARE)
-    pixels, z, area, thickness, behind = _measure(metres, labels, number, JUMP_M, JUMP_SHARE)
-    mean = z / np.maximum(pixels, 1)
-    return Pieces(labels, area / (camera.fx * camera.fy), pixels, mean, thickness * mean / camera.fx, behind)
+    pixels, z, area, thickness, behind = _measure(metres, labels, number)
+    return Pieces(labels, area / (camera.fx * camera.fy), pixels, thickness * z / pixels / camera.fx, behind)
 
 
 class Person(NamedTuple):
@@ -75,20 +72,17 @@ class Person(NamedTuple):
     num_flying: int
 
 
-def find_person(metres: np.ndarray, camera: Camera, is_seed: np.ndarray | None = None) -> Person:
+def find_person(metres: np.ndarray, camera: Camera) -> Person:
     """The largest piece of a depth image and all that is near it in space, without rims and flying pixels.
 
     Args:
         metres: `(H, W)` float32, metres; 0 is nothing; something is there.
         camera: The camera of this image.
-        is_seed: `(H, W)` bool, where the person is known to be: the largest piece of these pixels begins it.
     """
     pieces = pieces_of(metres, camera)
     number = len(pieces.pixels)
     # A wide rim of a background far behind may have a larger area.
     first = int((pieces.area_m2 * np.minimum(pieces.thickness_m, 0.15) * (1.05 - pieces.is_behind)).argmax())
-    if is_seed is not None and (is_seed & (metres > 0)).any():
-        first = int(np.bincount(pieces.labels[is_seed & (metres > 0)]).argmax())
     v, u = np.nonzero(metres)
     z = metres[v, u].astype(np.float64)
     points = np.stack([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z], -1)
@@ -146,7 +140,7 @@ def _label(metres: np.ndarray, jump: float, share: float) -> tuple[np.ndarray, i
     """Pieces by their numbers, `(H, W)`, and how many; of eight neighbours."""
     height, width = metres.shape
     labels = np.full((height, width), -1, np.int32)
-    parents = np.empty(height * width // 2 + 2, np.int32)
+    parents = np.empty(height * width, np.int32)  # in noise every pixel may begin a piece
     number = 0
     for v in range(height):
         for u in range(width):
@@ -188,7 +182,7 @@ def _label(metres: np.ndarray, jump: float, share: float) -> tuple[np.ndarray, i
 
 @numba.njit(cache=True, nogil=True)
 def _measure(
-    metres: np.ndarray, labels: np.ndarray, number: int, jump: float, share: float
+    metres: np.ndarray, labels: np.ndarray, number: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Of each piece: pixels, sums of depth and of its square, thickness in pixels, share of the rim that is behind."""
     height, width = metres.shape

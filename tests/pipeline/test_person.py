@@ -47,6 +47,14 @@ def test_pieces_are_those_of_a_slow_search():
     assert (pieces.labels[metres == 0] == -1).all()
 
 
+def test_an_image_of_noise_has_a_piece_for_each_pixel_and_is_refused():
+    camera, metres = Camera(92.0, 92.0, 52.0, 63.0, 106, 128), np.ones((128, 106), np.float32)
+    metres[::2, ::2], metres[1::2, ::2], metres[::2, 1::2] = 2, 3, 4  # no two neighbours are alike
+    assert len(pieces_of(metres, camera).pixels) == metres.size
+    with pytest.raises(ValueError, match="a person"):
+        body_depth(metres, camera)
+
+
 def test_thickness_is_that_of_the_largest_square_inside():
     metres = np.zeros((40, 40), np.float32)
     metres[5:25, 5:12] = 2.0  # 7 px wide
