@@ -325,7 +325,7 @@ def add_object(
             if inside < 0.0:
                 continue
             z = z0 - thickness * np.sqrt(inside) + slope_u * (u - u0) + slope_v * (v - v0)
-            if depth[v, u] <= 0.0 or z < depth[v, u]:
+            if z > 0.1 and (depth[v, u] <= 0.0 or z < depth[v, u]):  # not through the lens
                 depth[v, u] = z
                 _widen(spans, v, u)
 
