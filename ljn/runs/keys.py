@@ -79,6 +79,7 @@ KEYS: dict[str, Key] = {
         _MODEL,
         "_target_ _convert_ net optimizer scheduler genders predicted loss loss_vertices joint_weight",
     ),
+    **_rows("module", _MODEL, "target_sigmas hard_keypoints backbone_weights"),
     **_rows("module", Key.THROUGH | Key.ONE_STAGE, "body_path"),
     "data": _DATA,
     **_rows(
