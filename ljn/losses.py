@@ -70,7 +70,8 @@ def heatmap_loss(
 ) -> Tensor:
     """Return CPN's loss (Chen et al. 2018): half of the mean over GlobalNet's levels, plus RefineNet's hardest joints.
 
-    A joint's loss is its map's squared difference, summed over the cells; averages are over joints and samples.
+    A joint's loss is its map's mean squared difference; averages are over joints and samples. It is small on purpose:
+    RAdam's first steps are as large as the gradient, and of sums over the cells they would be the last.
 
     Args:
         heatmaps: GlobalNet's, then RefineNet's as the last, `(B, K, h, w)` each.
@@ -82,7 +83,7 @@ def heatmap_loss(
         Scalar.
     """
     losses = [
-        (maps - target).square().sum((-2, -1)) * is_seen
+        (maps - target).square().mean((-2, -1)) * is_seen
         for maps, target in zip(heatmaps, targets, strict=True)
     ]
     *levels, refined = losses
