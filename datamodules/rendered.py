@@ -58,7 +58,7 @@ class RenderedDataModule(DataModule):
         prefetch_batches: Batches that each worker keeps ready.
     """
 
-    version: int
+    version: int | str
     """Raised with every change of the samples made of the same records: results are comparable within one only."""
     starts_fresh = False
     """Whether workers start as fresh processes, not as copies of this one."""

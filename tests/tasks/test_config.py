@@ -42,6 +42,7 @@ def test_every_config_composes_validates_and_builds(choice, compose_config, tmp_
         for name in ("body_network", "body_network_on_pointnet", "direct_body_network", "kinematic")
     ]
     partners |= dict.fromkeys(of_bodies, "module=mesh_regressor")
+    partners |= {f"data/photo={name}": "data=rgb" for name in ("plain", "realistic")}
     if choice in partners:
         overrides.append(partners[choice])
     cfg = compose_config(*overrides, return_hydra_config=True)
