@@ -401,7 +401,7 @@ def _on(device: torch.device, tensors: dict[str, torch.Tensor]) -> dict[str, tor
 
 
 def _stage(module: Any, checkpoint: Checkpoint) -> Stage:
-    if checkpoint.recipe is None:
+    if not isinstance(checkpoint.recipe, ObservationRecipe):
         raise ValueError(
             f"'{checkpoint.path}': it was not trained on observations of depth images, so none can be made for it"
         )

@@ -90,6 +90,8 @@ KEYS: dict[str, Key] = {
     **_rows(
         "data.synthesis", _DATA, "keypoint_noise_px missing_keypoints focal_factors pixel_factors renderer"
     ),
+    **_rows("data", _DATA, "recipe background photo"),
+    **_rows("data.synthesis", _DATA, "scale shift rotation_deg mirrored"),
     **_rows("data.synthesis", _DATA | Key.ONE_STAGE, "initial_joints joint_noise_m joint_noise"),
     **_rows("data.observation", _DATA, "_target_ _convert_ num_points normals crop_px"),
     **_rows("data", Key.THROUGH | Key.CHANGEABLE | Key.ONE_STAGE, "detector_ckpt"),

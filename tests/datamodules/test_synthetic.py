@@ -87,7 +87,7 @@ def test_a_smaller_validation_set_shares_its_draws_with_a_larger_one(make_datamo
 def test_a_fixed_set_is_rendered_once_and_shared_by_data_modules_that_want_the_same(
     make_datamodule, tmp_path, caplog
 ):
-    with caplog.at_level(logging.INFO, "datamodules.synthetic"):
+    with caplog.at_level(logging.INFO, "datamodules"):
         first = val_set(make_datamodule(num_val=4, cache_dir=tmp_path))
         assert "rendering 4 val samples" in caplog.text
         caplog.clear()
@@ -100,7 +100,7 @@ def test_poses_are_made_once_and_shared_by_data_modules_that_want_the_same(make_
         caplog.clear()
         return make_datamodule(num_train=4, cache_dir=tmp_path, **changes).describe(("train",))["pool"]
 
-    with caplog.at_level(logging.INFO, "datamodules.synthetic"):
+    with caplog.at_level(logging.INFO, "datamodules"):
         first = hashes()
         assert "making 4 train poses" in caplog.text
         assert hashes(seed=1, num_val=1, reuse=2) == first

@@ -43,6 +43,7 @@ def test_every_config_composes_validates_and_builds(choice, compose_config, tmp_
     ]
     partners |= dict.fromkeys(of_bodies, "module=mesh_regressor")
     partners |= {"model=cpn": "module=keypoint_detector", "module=keypoint_detector": "model=cpn"}
+    partners |= {f"data/photo={name}": "data=rgb" for name in ("plain", "realistic")}
     if choice in partners:
         overrides.append(partners[choice])
     if "model=cpn" in overrides:
