@@ -4,9 +4,11 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cached_property
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -17,11 +19,14 @@ from datamodules.rendered import RenderedDataModule
 from datamodules.sensor import Sensor
 from datamodules.sources import PoseSource
 from datamodules.synthesis import SAMPLES_VERSION, DepthSynthesizer, SynthesisSettings
+from ljn.cloud.lifting import depth_at
 from ljn.cloud.normals import get_normal_estimator
 from ljn.cloud.observation import ObservationRecipe
 from ljn.data import SPLITS, Batch
-from ljn.geometry.camera import Camera
+from ljn.geometry.camera import Camera, back_project, transfer
 from ljn.modules.joint_detector import JointDetector
+from ljn.modules.keypoint_detector import KeypointDetector
+from ljn.pipeline.keypoints import MIN_CONFIDENCE
 from ljn.render import get_renderer
 from ljn.runs.checkpoints import Checkpoint, load_module
 
@@ -55,6 +60,8 @@ class SyntheticDepthDataModule(RenderedDataModule):
             samples, but make some anew.
         sensor: What becomes of bodies and images before they are observed; None for `gaussian`, the thesis's noise. See
             `datamodules.sensor`.
+        keypoint_ckpt: Checkpoint of a keypoint detector that sees depth images, whose keypoints then stand in place of
+            the true ones with noise; it runs on the training device.
         num_workers: Worker processes; 0 renders in the main process.
         prefetch_batches: Batches that each worker keeps ready.
     """
@@ -80,6 +87,7 @@ class SyntheticDepthDataModule(RenderedDataModule):
         redraw_each_epoch: bool = True,
         reuse: int | None = None,
         sensor: Sensor | None = None,
+        keypoint_ckpt: str | Path | None = None,
         num_workers: int = 1,
         prefetch_batches: int = 4,
     ) -> None:
@@ -100,10 +108,12 @@ class SyntheticDepthDataModule(RenderedDataModule):
         )
         check_margin(smallest_camera(camera, synthesis), synthesis.margin_px)
         self.camera = camera
-        # A detector moves the lifted joints.
-        self.synthesis = replace(synthesis, initial_joints="lifted") if detector_ckpt else synthesis
+        # A detector moves the lifted joints, and found keypoints are lifted.
+        is_lifted = detector_ckpt or keypoint_ckpt
+        self.synthesis = replace(synthesis, initial_joints="lifted") if is_lifted else synthesis
         self.observation = observation
         self.detector_ckpt = detector_ckpt
+        self.keypoint_ckpt = keypoint_ckpt
         self.sensor = sensor
 
     @property
@@ -115,9 +125,12 @@ class SyntheticDepthDataModule(RenderedDataModule):
     @property
     def fingerprint(self) -> str:
         """See `DataModule`."""
-        if self._detector_checkpoint is None:
+        networks = [
+            each[1].file_hash for each in (self._detector_checkpoint, self._keypoint_checkpoint) if each
+        ]
+        if not networks:
             return self._samples_fingerprint
-        made_of = f"{self._samples_fingerprint} {self._detector_checkpoint[1].file_hash}"
+        made_of = " ".join([self._samples_fingerprint, *networks])
         return hashlib.sha256(made_of.encode()).hexdigest()[:16]
 
     def examples(self, split: str, indices: Sequence[int]) -> tuple[Batch, Tensor]:
@@ -128,10 +141,13 @@ class SyntheticDepthDataModule(RenderedDataModule):
 
     def describe(self, splits: Sequence[str] = SPLITS) -> dict[str, Any]:
         """See `DataModule`."""
-        detector = None
-        if self._detector_checkpoint is not None:
-            detector = {"path": str(self.detector_ckpt), "hash": self._detector_checkpoint[1].file_hash}
-        return super().describe(splits) | {"detector": detector}
+        networks = {}
+        for name, path, loaded in (
+            ("detector", self.detector_ckpt, self._detector_checkpoint),
+            ("keypoint_detector", self.keypoint_ckpt, self._keypoint_checkpoint),
+        ):
+            networks[name] = None if loaded is None else {"path": str(path), "hash": loaded[1].file_hash}
+        return super().describe(splits) | networks
 
     def prepare_data(self) -> None:
         """See `RenderedDataModule`."""
@@ -144,6 +160,8 @@ class SyntheticDepthDataModule(RenderedDataModule):
                     f"{unknown[0]} is not among them; a model is only meaningful with its "
                     "bodies"
                 )
+        if self._keypoint_checkpoint is not None:
+            _check_sight(*self._keypoint_checkpoint, self.observation)
         get_renderer(self.synthesis.renderer)
         get_normal_estimator(self.observation.normals)
 
@@ -153,9 +171,21 @@ class SyntheticDepthDataModule(RenderedDataModule):
             return None
         return load_module(self.detector_ckpt, JointDetector, "detector_ckpt")
 
+    @cached_property
+    def _keypoint_checkpoint(self) -> tuple[KeypointDetector, Checkpoint] | None:
+        if self.keypoint_ckpt is None:
+            return None
+        return load_module(self.keypoint_ckpt, KeypointDetector, "keypoint_ckpt")
+
     @torch.no_grad()
     def on_after_batch_transfer(self, batch: Batch, dataloader_idx: int) -> Batch:
-        """Let the detector, where there is one, move the initial joints; on the device of the batch."""
+        """Let the networks before the trained one, where there are some, do their part on the device of the batch.
+
+        A keypoint detector's keypoints take the place of the noisy ones, and are lifted; a joint detector moves the
+        initial joints.
+        """
+        if self._keypoint_checkpoint is not None:
+            batch = _with_found_keypoints(batch, self._keypoint_checkpoint[0].to(batch["crop"].device))
         if self._detector_checkpoint is None:
             return batch
         lifted = batch["initial_joints"]
@@ -169,9 +199,9 @@ class SyntheticDepthDataModule(RenderedDataModule):
 
     @property
     def _observed(self) -> frozenset[str]:
-        """What is made of an observation: what the network takes, and the detector before it."""
-        detector = () if self._detector_checkpoint is None else self._detector_checkpoint[0].takes
-        return frozenset((*self.takes, *detector))
+        """What is made of an observation: what the network takes, and those before it."""
+        networks = [each[0].takes for each in (self._detector_checkpoint, self._keypoint_checkpoint) if each]
+        return frozenset((*self.takes, *chain.from_iterable(networks)))
 
     def _synthesizer(self, split: str) -> DepthSynthesizer:
         is_train = split == "train"
@@ -198,3 +228,32 @@ class SyntheticDepthDataModule(RenderedDataModule):
     def starts_fresh(self) -> bool:  # type: ignore[override]
         """See `RenderedDataModule`: a GL context does not survive a fork."""
         return self.synthesis.renderer == "pyrender"
+
+
+def _check_sight(module: KeypointDetector, checkpoint: Checkpoint, observation: ObservationRecipe) -> None:
+    """Raise a `ValueError` unless a keypoint detector sees crops like those of the data."""
+    if module.net.sees != "depth" or not isinstance(checkpoint.recipe, ObservationRecipe):
+        raise ValueError(
+            f"keypoint_ckpt: expected a keypoint detector that sees depth images, which is what this data has, got one "
+            f"that sees {module.net.sees} ('{checkpoint.path}'); train experiment=keypoints/cpn_depth"
+        )
+    if checkpoint.recipe.crop_px != observation.crop_px:
+        raise ValueError(
+            f"keypoint_ckpt: '{checkpoint.path}' sees crops of {checkpoint.recipe.crop_px} px, those of the data have "
+            f"{observation.crop_px}; set data.observation.crop_px={checkpoint.recipe.crop_px}"
+        )
+
+
+def _with_found_keypoints(batch: Batch, module: KeypointDetector) -> Batch:
+    """A batch whose keypoints, confidences and initial joints are those that a keypoint detector finds in the crops."""
+    found = module(batch)
+    confidences = torch.where(found.confidences < MIN_CONFIDENCE, 0.0, found.confidences)
+    crops, places = (value.cpu().numpy() for value in (batch["crop"], found.keypoints))
+    depth = torch.from_numpy(np.stack([depth_at(*each) for each in zip(places, crops)])).to(found.keypoints)
+    made = {
+        "keypoints": transfer(found.keypoints, batch["crop_camera"], batch["camera"]),
+        "initial_joints": back_project(found.keypoints, depth, batch["crop_camera"]),
+    }
+    if "confidences" in batch:
+        made["confidences"] = confidences
+    return Batch(**{**batch, **made})

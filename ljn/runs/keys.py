@@ -95,7 +95,7 @@ KEYS: dict[str, Key] = {
     **_rows("data.synthesis", _DATA | Key.ONE_STAGE, "initial_joints joint_noise_m joint_noise"),
     **_rows("data.observation", _DATA, "_target_ _convert_ num_points normals crop_px"),
     **_rows("data", Key.THROUGH | Key.CHANGEABLE | Key.ONE_STAGE, "detector_ckpt"),
-    **_rows("data", Key.THROUGH | Key.CHANGEABLE, "source body_path"),
+    **_rows("data", Key.THROUGH | Key.CHANGEABLE, "source body_path keypoint_ckpt"),
     **_rows("data", Key.MACHINE | Key.CHANGEABLE, "cache_dir num_workers prefetch_batches"),
     "trainer": _DATA,
     **_rows("trainer", _DATA, "_target_ _convert_ max_epochs precision gradient_clip_val deterministic"),
