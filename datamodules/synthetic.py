@@ -256,4 +256,4 @@ def _with_found_keypoints(batch: Batch, module: KeypointDetector) -> Batch:
     }
     if "confidences" in batch:
         made["confidences"] = confidences
-    return Batch(**{**batch, **made})
+    return Batch(**{**batch, **made})  # type: ignore[typeddict-item]

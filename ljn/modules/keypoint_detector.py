@@ -79,11 +79,12 @@ class KeypointDetector(StageModule):
         image, camera = self.observation(batch)
         heatmaps = self.net.heatmaps(self.net.normalised(image))
         keypoints = project(batch["joints"], camera)
-        size = heatmaps[-1].shape[-2:]
-        width, height = STRIDE * size[1], STRIDE * size[0]
-        corner = keypoints.new_tensor([width - 0.5, height - 0.5])
+        rows, columns = heatmaps[-1].shape[-2:]
+        corner = keypoints.new_tensor([STRIDE * columns - 0.5, STRIDE * rows - 0.5])
         is_inside = ((keypoints > -0.5) & (keypoints < corner)).all(-1)
-        targets = [gaussian_heatmaps(keypoints, sigma, tuple(size), STRIDE) for sigma in self.target_sigmas]
+        targets = [
+            gaussian_heatmaps(keypoints, sigma, (rows, columns), STRIDE) for sigma in self.target_sigmas
+        ]
         return heatmap_loss(heatmaps, targets, is_inside, self.hard_keypoints)
 
     def evaluate(self, batch: Batch, metrics: Any) -> dict[str, Tensor]:
@@ -119,7 +120,7 @@ def load_backbone(backbone: nn.Module, path: str | Path) -> None:
         state = torch.load(path, map_location="cpu", weights_only=True)
         state = {name: value for name, value in state.items() if not name.startswith("fc.")}
         backbone.load_state_dict(state)
-    except (*READ_ERRORS, RuntimeError, AttributeError) as error:
+    except (RuntimeError, AttributeError, *READ_ERRORS) as error:  # type: ignore[misc]
         raise ValueError(
             f"backbone_weights: '{path}' is damaged, or does not hold the weights of this backbone "
             f"({reason(error)}); model.backbone's block, depths, widths and in_channels are to be those of the file"

@@ -93,7 +93,7 @@ class CascadedPyramidNetwork(nn.Module):
             Bottleneck(4 * channels, refine_width, 1, channels), nn.Conv2d(channels, NUM_JOINTS, 3, 1, 1)
         )
         for module in (*self.heads, self.last):
-            final: nn.Conv2d = module[-1]  # type: ignore[assignment, index]
+            final: nn.Conv2d = module[-1]
             nn.init.normal_(final.weight, std=0.001)
             nn.init.zeros_(final.bias)  # type: ignore[arg-type]
 

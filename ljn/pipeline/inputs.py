@@ -221,7 +221,7 @@ def _read_png(path: Path, name: str, modes: Sequence[str] = _GREY) -> np.ndarray
 
 
 def _read_image(
-    path: Path, name: str, modes: Sequence[str], formats: Sequence[str] = ("PNG", "JPEG")
+    path: Path, name: str, modes: Sequence[str], formats: tuple[str, ...] = ("PNG", "JPEG")
 ) -> np.ndarray:
     """The image as an array, in RGB unless its mode is one of `modes`."""
     from PIL import Image

@@ -203,7 +203,7 @@ class Pipeline:
         observations = []
         for number, (image, *others, colour) in enumerate(zip(depth, keypoints, masks, colours)):
             try:
-                observations.append(self.observe(image, camera, *others, rgb=colour))
+                observations.append(self.observe(image, camera, others[0], others[1], rgb=colour))
             except ValueError as error:
                 raise ValueError(f"image {number} of the batch: {error}") from error
         return self.predict(observations)
