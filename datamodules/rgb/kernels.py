@@ -6,11 +6,9 @@ import numpy as np
 from datamodules.rgb.look import CHECKS, CLOUDS, CUT, DOTS, MATERIAL, PLAIN, PRINT, STRIPES
 from datamodules.rgb.surface import ARM, HEAD, TRUNK
 
-_SIDE = 32
-_NOISE = np.random.default_rng(0).random(
-    (_SIDE, _SIDE, _SIDE), dtype=np.float32
-)  # the same for all; a sample's
-# place in it is drawn
+_LAST = 31  # one less than a power of 2
+_NOISE = np.random.default_rng(0).random((_LAST + 1,) * 3, dtype=np.float32)
+"""The same for all; a sample draws its place in it."""
 
 _SKIN, _HAIR, _SHIRT, _TROUSERS = MATERIAL["skin"], MATERIAL["hair"], MATERIAL["shirt"], MATERIAL["trousers"]
 _SHOES, _GLOVES, _SOCKS, _INNER = MATERIAL["shoes"], MATERIAL["gloves"], MATERIAL["socks"], MATERIAL["inner"]
@@ -25,6 +23,18 @@ _BEARD_TOP, _COLLAR, _V_NECK, _HEM, _WAIST = (
 )
 _SLEEVE, _GLOVE, _SKIRT, _TROUSER = CUT["sleeve"], CUT["glove"], CUT["skirt"], CUT["trousers"]
 _SOCK, _SHOE, _OPENING, _BELT_HALF = CUT["sock"], CUT["shoe"], CUT["opening"], CUT["belt"]
+
+
+@numba.njit(cache=True, nogil=True)
+def image_box(vertices: np.ndarray, intrinsics: np.ndarray) -> tuple[float, float, float, float]:
+    """First and last column, first and last row of the pixels that a mesh `(V, 3)`, camera frame, can cover."""
+    left = top = np.inf
+    right = bottom = -np.inf
+    for i in range(len(vertices)):
+        u = vertices[i, 0] / vertices[i, 2] * intrinsics[0] + intrinsics[2]
+        v = vertices[i, 1] / vertices[i, 2] * intrinsics[1] + intrinsics[3]
+        left, right, top, bottom = min(left, u), max(right, u), min(top, v), max(bottom, v)
+    return np.ceil(left), np.floor(right), np.ceil(top), np.floor(bottom)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -56,8 +66,8 @@ def _noise(x: float, y: float, z: float) -> float:
     """Smooth noise in 0-1, a new number at every whole one."""
     x0, y0, z0 = np.floor(x), np.floor(y), np.floor(z)
     u, v, w = x - x0, y - y0, z - z0
-    i, j, k = int(x0) % _SIDE, int(y0) % _SIDE, int(z0) % _SIDE
-    i1, j1, k1 = (i + 1) % _SIDE, (j + 1) % _SIDE, (k + 1) % _SIDE
+    i, j, k = int(x0) & _LAST, int(y0) & _LAST, int(z0) & _LAST
+    i1, j1, k1 = (i + 1) & _LAST, (j + 1) & _LAST, (k + 1) & _LAST
     u, v, w = u * u * (3 - 2 * u), v * v * (3 - 2 * v), w * w * (3 - 2 * w)
     a = (_NOISE[i, j, k] * (1 - u) + _NOISE[i1, j, k] * u) * (1 - v)
     a += (_NOISE[i, j1, k] * (1 - u) + _NOISE[i1, j1, k] * u) * v

@@ -20,7 +20,7 @@ class Tone(ColourStep):
         saturation: Of the saturation, as a share.
     """
 
-    gain: float = 0.45
+    gain: float = 0.35
     balance: float = 0.12
     contrast: float = 0.15
     gamma: float = 0.12
@@ -144,7 +144,7 @@ class MaskErrors(ColourStep):
     Attributes:
         rim: Greatest width of the rim, or of what is eaten, as a share of the crop's height.
         ragged: How uneven the border is, as a share of that width.
-        holes: Greatest number of holes, and of spots.
+        holes: Greatest number of holes, and of spots of the background, anywhere in the crop.
         size: Range of their radius, as a share of the crop's height.
     """
 
@@ -162,17 +162,11 @@ class MaskErrors(ColourStep):
         coarse = rng.random((height // 16 + 1, width // 16 + 1), dtype=np.float32)
         uneven = cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC) - 0.5
         moved = ((inside - outside) + shift * (1 + 2 * self.ragged * uneven) > 0).astype(np.uint8)
-        rows, columns = np.nonzero(mask)
         for value in (0, 1):
-            for _ in range(int(rng.integers(0, int(strength * self.holes) + 1))):
-                place = int(rng.integers(len(rows))) if len(rows) else 0
+            for _ in range(int(rng.integers(0, int(self.holes) + 1))):
+                centre = rng.random(2) * (width, height)
                 radii = np.maximum(strength * height * rng.uniform(*self.size, 2), 1)
-                angle, away = (
-                    rng.uniform(0, 180),
-                    rng.standard_normal(2) * (0 if value == 0 else 0.05 * height),
-                )
-                if value == 0 or rng.random() < 0.3:
-                    centre = np.rint((columns[place] + away[0], rows[place] + away[1])).astype(int).tolist()
-                    cv2.ellipse(moved, centre, np.rint(radii).astype(int).tolist(), angle, 0, 360, value, -1)
+                centre, axes = (np.rint(numbers).astype(int).tolist() for numbers in (centre, radii))
+                cv2.ellipse(moved, centre, axes, rng.uniform(0, 180), 0, 360, value, -1)
         if moved.any():
             photo.mask = moved

@@ -204,9 +204,7 @@ class RgbSynthesizer(BodySynthesizer):
         return np.ascontiguousarray(crop), own
 
     def _window(self, vertices: np.ndarray, intrinsics: np.ndarray, variation: _Variation) -> Window:
-        pixels = vertices[:, :2] / vertices[:, 2:] * intrinsics[:2] + intrinsics[2:]
-        (left, top), (right, bottom) = np.ceil(pixels.min(0)), np.floor(pixels.max(0))
-        left, top, width, height = body_window(left, right, top, bottom, self.recipe)
+        left, top, width, height = body_window(*kernels.image_box(vertices, intrinsics), self.recipe)
         across, down = width * variation.scale, height * variation.scale
         left += (width - across) / 2 + variation.shift[0] * across
         top += (height - down) / 2 + variation.shift[1] * down
