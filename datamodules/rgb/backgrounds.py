@@ -1,7 +1,7 @@
 """What is behind the person."""
 
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 
 import cv2
@@ -9,6 +9,7 @@ import numpy as np
 
 BACKGROUNDS = ("black", "random", "green")
 _SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".webp")
+_COARSER = 4
 _GREEN = np.array([0.16, 0.55, 0.22])
 
 
@@ -37,18 +38,26 @@ class Background:
                 "random"
             )
 
-    @cached_property
+    @property
     def _files(self) -> list[Path]:
-        return sorted(path for path in Path(str(self.path)).rglob("*") if path.suffix.lower() in _SUFFIXES)
+        return _images_in(str(self.path))
 
     def image(self, height: int, width: int, rng: np.random.Generator) -> np.ndarray:
         """A background `(h, w, 3)` float32, RGB in 0-1."""
-        is_green = self.kind == "green" or (self.kind == "black" and rng.random() < 0.5)
-        if is_green:
+        if self.kind == "black":  # of which a rim is seen at most
+            kind = "green" if rng.random() < 0.5 else "random"
+            coarse = replace(self, kind=kind).image(height // _COARSER, width // _COARSER, rng)
+            return cv2.resize(coarse, (width, height))
+        if self.kind == "green":
             return _curtain(height, width, rng)
         if self.path is not None:
             return _part_of(self._files[int(rng.integers(len(self._files)))], height, width, rng)
         return _random_image(height, width, rng)
+
+
+@lru_cache(maxsize=8)
+def _images_in(folder: str) -> list[Path]:
+    return sorted(path for path in Path(folder).rglob("*") if path.suffix.lower() in _SUFFIXES)
 
 
 def _curtain(height: int, width: int, rng: np.random.Generator) -> np.ndarray:

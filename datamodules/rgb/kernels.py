@@ -1,4 +1,4 @@
-"""Loops over pixels and vertices, compiled by numba: the body's surface painted and lit, images halved."""
+"""Loops over pixels and vertices, compiled by numba: the body's surface painted and lit, pictures composed."""
 
 import numba
 import numpy as np
@@ -260,14 +260,62 @@ def paint(
 
 
 @numba.njit(cache=True, nogil=True)
-def halved(image: np.ndarray) -> np.ndarray:
-    """An image `(2 h, 2 w, C)` float32 with half of the rows and columns, means of four pixels."""
-    height, width, channels = image.shape[0] // 2, image.shape[1] // 2, image.shape[2]
-    half = np.empty((height, width, channels), np.float32)
+def facing(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """The numbers of the faces that are turned towards the camera: of a closed surface, all that can be seen."""
+    chosen = np.empty(len(faces), np.int64)
+    number = 0
+    for f in range(len(faces)):
+        i, j, k = faces[f, 0], faces[f, 1], faces[f, 2]
+        ax, ay, az = vertices[i, 0], vertices[i, 1], vertices[i, 2]
+        bx, by, bz = vertices[j, 0] - ax, vertices[j, 1] - ay, vertices[j, 2] - az
+        cx, cy, cz = vertices[k, 0] - ax, vertices[k, 1] - ay, vertices[k, 2] - az
+        if ax * (by * cz - bz * cy) + ay * (bz * cx - bx * cz) + az * (bx * cy - by * cx) <= 0.0:
+            chosen[number] = f
+            number += 1
+    return chosen[:number]
+
+
+@numba.njit(cache=True, nogil=True)
+def _share(mask: np.ndarray, v: int, u: int) -> float:
+    """How many of the four pixels of a mask `(2 h, 2 w)`, 0 or 1, are set that one of half its size is made of."""
+    count = int(mask[2 * v, 2 * u]) + int(mask[2 * v, 2 * u + 1])
+    return 0.25 * (count + int(mask[2 * v + 1, 2 * u]) + int(mask[2 * v + 1, 2 * u + 1]))
+
+
+@numba.njit(cache=True, nogil=True)
+def composed(person: np.ndarray, mask: np.ndarray, behind: np.ndarray) -> np.ndarray:
+    """The person before a background, as a screen shows it: the square root of linear light.
+
+    Args:
+        person: `(2 h, 2 w, 3)` float32, linear RGB, 0 where the mask is.
+        mask: `(2 h, 2 w)` uint8, 1 on the person.
+        behind: `(h, w, 3)` float32, as a screen shows it.
+
+    Returns:
+        `(h, w, 3)` float32 in 0-1.
+    """
+    picture = np.empty_like(behind)
+    for v in range(behind.shape[0]):
+        for u in range(behind.shape[1]):
+            share = np.float32(_share(mask, v, u))
+            for c in range(3):
+                shown = (1 - share) * behind[v, u, c]
+                if share > 0:
+                    light = person[2 * v, 2 * u, c] + person[2 * v, 2 * u + 1, c]
+                    light += person[2 * v + 1, 2 * u, c] + person[2 * v + 1, 2 * u + 1, c]
+                    shown += share * np.sqrt(np.float32(0.25) * light / share)
+                picture[v, u, c] = min(max(shown, np.float32(0)), np.float32(1))
+    return picture
+
+
+@numba.njit(cache=True, nogil=True)
+def finished(picture: np.ndarray, mask: np.ndarray, is_black: bool) -> np.ndarray:
+    """A picture `(h, w, 3)` in 0-1 as `(3, h, w)` uint8; black outside of the mask `(2 h, 2 w)`, if so wanted."""
+    height, width = picture.shape[:2]
+    crop = np.empty((3, height, width), np.uint8)
     for v in range(height):
         for u in range(width):
-            for c in range(channels):
-                total = image[2 * v, 2 * u, c] + image[2 * v, 2 * u + 1, c]
-                total += image[2 * v + 1, 2 * u, c] + image[2 * v + 1, 2 * u + 1, c]
-                half[v, u, c] = 0.25 * total
-    return half
+            share = _share(mask, v, u) if is_black else 1.0
+            for c in range(3):
+                crop[c, v, u] = np.uint8(255 * share * min(max(picture[v, u, c], 0.0), 1.0) + 0.5)
+    return crop

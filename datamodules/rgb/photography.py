@@ -29,13 +29,16 @@ class Tone(ColourStep):
     def photograph(self, photo: Photo, rng: np.random.Generator, strength: float) -> None:
         """See `ColourStep`."""
         gain, *balance, contrast, gamma, saturation = strength * rng.standard_normal(7)
-        gains = 2 ** ((self.gain * gain + self.balance * np.array(balance)) / 2.2)
-        rgb = photo.rgb * gains.astype(np.float32)
-        middle = float(rgb.mean())
-        rgb = middle + (rgb - middle) * np.float32(np.exp(self.contrast * contrast))
-        grey = rgb.mean(-1, keepdims=True)
-        rgb = grey + (rgb - grey) * np.float32(np.exp(self.saturation * saturation))
-        photo.rgb = cv2.pow(np.clip(rgb, 0, 1), float(np.exp(self.gamma * gamma)))
+        gains = 2 ** (
+            (self.gain * gain + self.balance * np.array(balance)) / 2
+        )  # of light, whose roots these are
+        vivid, contrast = np.exp(self.saturation * saturation), np.exp(self.contrast * contrast)
+        mixed = contrast * gains[:, None] * (vivid * np.eye(3) + (1 - vivid) / 3)
+        moved = (1 - contrast) * gains * np.array(cv2.mean(photo.rgb)[:3])
+        rgb = cv2.transform(photo.rgb, np.concatenate([mixed, moved[:, None]], 1))
+        # A camera's files have 8 bits.
+        levels = (np.arange(256) / 255) ** np.exp(self.gamma * gamma)
+        photo.rgb = cv2.LUT(cv2.convertScaleAbs(np.maximum(rgb, 0), alpha=255), levels.astype(np.float32))
 
 
 @dataclass(frozen=True, kw_only=True)

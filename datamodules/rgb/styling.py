@@ -8,7 +8,7 @@ import numpy as np
 from datamodules.rgb.chain import ColourStep
 from datamodules.rgb.look import CHECKS, CLOUDS, DOTS, MATERIAL, PRINT, SPOTS, STRIPES, Look
 
-_DISPLAY_GAMMA = 2.2
+_DISPLAY_GAMMA = 2  # see `kernels.composed`
 _SKINS = (
     (0.96, 0.80, 0.70), (0.90, 0.70, 0.57), (0.78, 0.57, 0.43), (0.60, 0.41, 0.30), (0.38, 0.25, 0.18),
     (0.24, 0.16, 0.12),
