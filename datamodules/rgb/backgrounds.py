@@ -1,7 +1,7 @@
 """What is behind the person."""
 
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 
 import cv2
@@ -9,6 +9,7 @@ import numpy as np
 
 BACKGROUNDS = ("black", "random", "green")
 _SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".webp")
+_COARSER = 4
 _GREEN = np.array([0.16, 0.55, 0.22])
 
 
@@ -37,46 +38,55 @@ class Background:
                 "random"
             )
 
-    @cached_property
+    @property
     def _files(self) -> list[Path]:
-        return sorted(path for path in Path(str(self.path)).rglob("*") if path.suffix.lower() in _SUFFIXES)
+        return _images_in(str(self.path))
 
     def image(self, height: int, width: int, rng: np.random.Generator) -> np.ndarray:
         """A background `(h, w, 3)` float32, RGB in 0-1."""
-        is_green = self.kind == "green" or (self.kind == "black" and rng.random() < 0.5)
-        if is_green:
+        if self.kind == "black":  # of which a rim is seen at most
+            kind = "green" if rng.random() < 0.5 else "random"
+            coarse = replace(self, kind=kind).image(height // _COARSER, width // _COARSER, rng)
+            return cv2.resize(coarse, (width, height))
+        if self.kind == "green":
             return _curtain(height, width, rng)
         if self.path is not None:
             return _part_of(self._files[int(rng.integers(len(self._files)))], height, width, rng)
         return _random_image(height, width, rng)
 
 
+@lru_cache(maxsize=8)
+def _images_in(folder: str) -> list[Path]:
+    return sorted(path for path in Path(folder).rglob("*") if path.suffix.lower() in _SUFFIXES)
+
+
 def _curtain(height: int, width: int, rng: np.random.Generator) -> np.ndarray:
     """Green cloth: its light varies smoothly, and in folds from top to bottom."""
-    light = rng.uniform(0.6, 1.3) + rng.uniform(0, 0.3) * _smooth((3, 3), height, width, rng, 1)
-    folds = rng.uniform(0, 0.12) * _smooth((2, int(rng.integers(6, 30))), height, width, rng, 1)
-    colour = _GREEN * (1 + 0.15 * rng.standard_normal(3))
-    return np.clip((light + folds)[..., None] * colour, 0, 1).astype(np.float32)
+    uneven = rng.uniform(0, 0.15) * _smooth((3, 3), height, width, rng)
+    uneven += rng.uniform(0, 0.1) * _smooth((2, int(rng.integers(6, 30))), height, width, rng)
+    colour = rng.uniform(0.6, 1.3) * _GREEN * (1 + 0.15 * rng.standard_normal(3))
+    return np.minimum(cv2.exp(uneven)[..., None] * colour, 1).astype(np.float32)
 
 
 def _random_image(height: int, width: int, rng: np.random.Generator) -> np.ndarray:
     """Gradients, noise of several scales, stripes and shapes."""
-    image = 0.5 + 0.3 * rng.standard_normal(3) + 0.35 * _smooth((3, 3), height, width, rng, 3)
+    vivid = rng.random() ** 2  # most are pale, as rooms are
+    tints = 0.5 + 0.25 * rng.standard_normal((4, 1)) + 0.25 * vivid * rng.standard_normal((4, 3))
+    image = tints[0] + 0.2 * _smooth((3, 3), height, width, rng)[..., None] * (tints[1] + 0.5)
     for cells in (8, 24, 64):
         if rng.random() < 0.6:
-            image += rng.uniform(0, 0.25) * _smooth(
-                (cells, cells), height, width, rng, int(rng.choice([1, 3]))
-            )
+            noise = _smooth((cells, cells), height, width, rng)[..., None]
+            image += rng.uniform(0, 0.2) * noise * (0.5 + tints[2])
     if rng.random() < 0.3:
         rows, columns = np.mgrid[:height, :width]
         angle, period = rng.uniform(0, np.pi), rng.uniform(4, 40)
-        waves = np.sin(
-            2 * np.pi / period * (np.cos(angle) * columns + np.sin(angle) * rows) + rng.uniform(0, 6)
-        )
-        image += 0.15 * waves[..., None] * rng.standard_normal(3)
+        waves = np.sin(2 * np.pi / period * (np.cos(angle) * columns + np.sin(angle) * rows))
+        image += 0.15 * waves[..., None] * tints[3]
     image = np.ascontiguousarray(image, np.float32)
     for _ in range(int(rng.integers(0, 14))):
-        colour = np.clip(0.5 + 0.4 * rng.standard_normal(3), 0, 1).tolist()
+        colour = np.clip(
+            0.5 + 0.3 * rng.standard_normal() + 0.3 * vivid * rng.standard_normal(3), 0, 1
+        ).tolist()
         (u, v), (a, b) = rng.random(2) * (width, height), (2 + 0.3 * height * rng.random(2) ** 2)
         centre, axes = (int(u), int(v)), (int(a), int(b))
         thickness = -1 if rng.random() < 0.6 else int(rng.integers(1, 5))
@@ -94,14 +104,10 @@ def _random_image(height: int, width: int, rng: np.random.Generator) -> np.ndarr
     return np.clip(image, 0, 1)
 
 
-def _smooth(
-    cells: tuple[int, int], height: int, width: int, rng: np.random.Generator, channels: int
-) -> np.ndarray:
-    """Noise of standard deviation 1 at the nodes of a grid, smooth between them; `(h, w)` or `(h, w, 3)`."""
-    nodes = rng.standard_normal((*cells, channels), dtype=np.float32)
-    return cv2.resize(nodes, (width, height), interpolation=cv2.INTER_CUBIC).reshape(
-        (height, width) if channels == 1 and cells[0] < 4 else (height, width, channels)
-    )
+def _smooth(cells: tuple[int, int], height: int, width: int, rng: np.random.Generator) -> np.ndarray:
+    """Noise `(h, w)` float32 of standard deviation 1 at the nodes of a grid, smooth between them."""
+    nodes = rng.standard_normal(cells, dtype=np.float32)
+    return cv2.resize(nodes, (width, height), interpolation=cv2.INTER_CUBIC)
 
 
 def _part_of(path: Path, height: int, width: int, rng: np.random.Generator) -> np.ndarray:

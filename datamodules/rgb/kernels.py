@@ -1,4 +1,4 @@
-"""Loops over pixels and vertices, compiled by numba: the body's surface painted and lit, images halved."""
+"""Loops over pixels and vertices, compiled by numba: the body's surface painted and lit, pictures composed."""
 
 import numba
 import numpy as np
@@ -6,11 +6,9 @@ import numpy as np
 from datamodules.rgb.look import CHECKS, CLOUDS, CUT, DOTS, MATERIAL, PLAIN, PRINT, STRIPES
 from datamodules.rgb.surface import ARM, HEAD, TRUNK
 
-_SIDE = 32
-_NOISE = np.random.default_rng(0).random(
-    (_SIDE, _SIDE, _SIDE), dtype=np.float32
-)  # the same for all; a sample's
-# place in it is drawn
+_LAST = 31  # one less than a power of 2
+_NOISE = np.random.default_rng(0).random((_LAST + 1,) * 3, dtype=np.float32)
+"""The same for all; a sample draws its place in it."""
 
 _SKIN, _HAIR, _SHIRT, _TROUSERS = MATERIAL["skin"], MATERIAL["hair"], MATERIAL["shirt"], MATERIAL["trousers"]
 _SHOES, _GLOVES, _SOCKS, _INNER = MATERIAL["shoes"], MATERIAL["gloves"], MATERIAL["socks"], MATERIAL["inner"]
@@ -25,6 +23,18 @@ _BEARD_TOP, _COLLAR, _V_NECK, _HEM, _WAIST = (
 )
 _SLEEVE, _GLOVE, _SKIRT, _TROUSER = CUT["sleeve"], CUT["glove"], CUT["skirt"], CUT["trousers"]
 _SOCK, _SHOE, _OPENING, _BELT_HALF = CUT["sock"], CUT["shoe"], CUT["opening"], CUT["belt"]
+
+
+@numba.njit(cache=True, nogil=True)
+def image_box(vertices: np.ndarray, intrinsics: np.ndarray) -> tuple[float, float, float, float]:
+    """First and last column, first and last row of the pixels that a mesh `(V, 3)`, camera frame, can cover."""
+    left = top = np.inf
+    right = bottom = -np.inf
+    for i in range(len(vertices)):
+        u = vertices[i, 0] / vertices[i, 2] * intrinsics[0] + intrinsics[2]
+        v = vertices[i, 1] / vertices[i, 2] * intrinsics[1] + intrinsics[3]
+        left, right, top, bottom = min(left, u), max(right, u), min(top, v), max(bottom, v)
+    return np.ceil(left), np.floor(right), np.ceil(top), np.floor(bottom)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -56,8 +66,8 @@ def _noise(x: float, y: float, z: float) -> float:
     """Smooth noise in 0-1, a new number at every whole one."""
     x0, y0, z0 = np.floor(x), np.floor(y), np.floor(z)
     u, v, w = x - x0, y - y0, z - z0
-    i, j, k = int(x0) % _SIDE, int(y0) % _SIDE, int(z0) % _SIDE
-    i1, j1, k1 = (i + 1) % _SIDE, (j + 1) % _SIDE, (k + 1) % _SIDE
+    i, j, k = int(x0) & _LAST, int(y0) & _LAST, int(z0) & _LAST
+    i1, j1, k1 = (i + 1) & _LAST, (j + 1) & _LAST, (k + 1) & _LAST
     u, v, w = u * u * (3 - 2 * u), v * v * (3 - 2 * v), w * w * (3 - 2 * w)
     a = (_NOISE[i, j, k] * (1 - u) + _NOISE[i1, j, k] * u) * (1 - v)
     a += (_NOISE[i, j1, k] * (1 - u) + _NOISE[i1, j1, k] * u) * v
@@ -250,14 +260,62 @@ def paint(
 
 
 @numba.njit(cache=True, nogil=True)
-def halved(image: np.ndarray) -> np.ndarray:
-    """An image `(2 h, 2 w, C)` float32 with half of the rows and columns, means of four pixels."""
-    height, width, channels = image.shape[0] // 2, image.shape[1] // 2, image.shape[2]
-    half = np.empty((height, width, channels), np.float32)
+def facing(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """The numbers of the faces that are turned towards the camera: of a closed surface, all that can be seen."""
+    chosen = np.empty(len(faces), np.int64)
+    number = 0
+    for f in range(len(faces)):
+        i, j, k = faces[f, 0], faces[f, 1], faces[f, 2]
+        ax, ay, az = vertices[i, 0], vertices[i, 1], vertices[i, 2]
+        bx, by, bz = vertices[j, 0] - ax, vertices[j, 1] - ay, vertices[j, 2] - az
+        cx, cy, cz = vertices[k, 0] - ax, vertices[k, 1] - ay, vertices[k, 2] - az
+        if ax * (by * cz - bz * cy) + ay * (bz * cx - bx * cz) + az * (bx * cy - by * cx) <= 0.0:
+            chosen[number] = f
+            number += 1
+    return chosen[:number]
+
+
+@numba.njit(cache=True, nogil=True)
+def _share(mask: np.ndarray, v: int, u: int) -> float:
+    """How many of the four pixels of a mask `(2 h, 2 w)`, 0 or 1, are set that one of half its size is made of."""
+    count = int(mask[2 * v, 2 * u]) + int(mask[2 * v, 2 * u + 1])
+    return 0.25 * (count + int(mask[2 * v + 1, 2 * u]) + int(mask[2 * v + 1, 2 * u + 1]))
+
+
+@numba.njit(cache=True, nogil=True)
+def composed(person: np.ndarray, mask: np.ndarray, behind: np.ndarray) -> np.ndarray:
+    """The person before a background, as a screen shows it: the square root of linear light.
+
+    Args:
+        person: `(2 h, 2 w, 3)` float32, linear RGB, 0 where the mask is.
+        mask: `(2 h, 2 w)` uint8, 1 on the person.
+        behind: `(h, w, 3)` float32, as a screen shows it.
+
+    Returns:
+        `(h, w, 3)` float32 in 0-1.
+    """
+    picture = np.empty_like(behind)
+    for v in range(behind.shape[0]):
+        for u in range(behind.shape[1]):
+            share = np.float32(_share(mask, v, u))
+            for c in range(3):
+                shown = (1 - share) * behind[v, u, c]
+                if share > 0:
+                    light = person[2 * v, 2 * u, c] + person[2 * v, 2 * u + 1, c]
+                    light += person[2 * v + 1, 2 * u, c] + person[2 * v + 1, 2 * u + 1, c]
+                    shown += share * np.sqrt(np.float32(0.25) * light / share)
+                picture[v, u, c] = min(max(shown, np.float32(0)), np.float32(1))
+    return picture
+
+
+@numba.njit(cache=True, nogil=True)
+def finished(picture: np.ndarray, mask: np.ndarray, is_black: bool) -> np.ndarray:
+    """A picture `(h, w, 3)` in 0-1 as `(3, h, w)` uint8; black outside of the mask `(2 h, 2 w)`, if so wanted."""
+    height, width = picture.shape[:2]
+    crop = np.empty((3, height, width), np.uint8)
     for v in range(height):
         for u in range(width):
-            for c in range(channels):
-                total = image[2 * v, 2 * u, c] + image[2 * v, 2 * u + 1, c]
-                total += image[2 * v + 1, 2 * u, c] + image[2 * v + 1, 2 * u + 1, c]
-                half[v, u, c] = 0.25 * total
-    return half
+            share = _share(mask, v, u) if is_black else 1.0
+            for c in range(3):
+                crop[c, v, u] = np.uint8(255 * share * min(max(picture[v, u, c], 0.0), 1.0) + 0.5)
+    return crop

@@ -20,7 +20,7 @@ class Tone(ColourStep):
         saturation: Of the saturation, as a share.
     """
 
-    gain: float = 0.45
+    gain: float = 0.35
     balance: float = 0.12
     contrast: float = 0.15
     gamma: float = 0.12
@@ -29,13 +29,16 @@ class Tone(ColourStep):
     def photograph(self, photo: Photo, rng: np.random.Generator, strength: float) -> None:
         """See `ColourStep`."""
         gain, *balance, contrast, gamma, saturation = strength * rng.standard_normal(7)
-        gains = 2 ** ((self.gain * gain + self.balance * np.array(balance)) / 2.2)
-        rgb = photo.rgb * gains.astype(np.float32)
-        middle = float(rgb.mean())
-        rgb = middle + (rgb - middle) * np.float32(np.exp(self.contrast * contrast))
-        grey = rgb.mean(-1, keepdims=True)
-        rgb = grey + (rgb - grey) * np.float32(np.exp(self.saturation * saturation))
-        photo.rgb = cv2.pow(np.clip(rgb, 0, 1), float(np.exp(self.gamma * gamma)))
+        gains = 2 ** (
+            (self.gain * gain + self.balance * np.array(balance)) / 2
+        )  # of light, whose roots these are
+        vivid, contrast = np.exp(self.saturation * saturation), np.exp(self.contrast * contrast)
+        mixed = contrast * gains[:, None] * (vivid * np.eye(3) + (1 - vivid) / 3)
+        moved = (1 - contrast) * gains * np.array(cv2.mean(photo.rgb)[:3])
+        rgb = cv2.transform(photo.rgb, np.concatenate([mixed, moved[:, None]], 1))
+        # A camera's files have 8 bits.
+        levels = (np.arange(256) / 255) ** np.exp(self.gamma * gamma)
+        photo.rgb = cv2.LUT(cv2.convertScaleAbs(np.maximum(rgb, 0), alpha=255), levels.astype(np.float32))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -144,7 +147,7 @@ class MaskErrors(ColourStep):
     Attributes:
         rim: Greatest width of the rim, or of what is eaten, as a share of the crop's height.
         ragged: How uneven the border is, as a share of that width.
-        holes: Greatest number of holes, and of spots.
+        holes: Greatest number of holes, and of spots of the background, anywhere in the crop.
         size: Range of their radius, as a share of the crop's height.
     """
 
@@ -162,17 +165,11 @@ class MaskErrors(ColourStep):
         coarse = rng.random((height // 16 + 1, width // 16 + 1), dtype=np.float32)
         uneven = cv2.resize(coarse, (width, height), interpolation=cv2.INTER_CUBIC) - 0.5
         moved = ((inside - outside) + shift * (1 + 2 * self.ragged * uneven) > 0).astype(np.uint8)
-        rows, columns = np.nonzero(mask)
         for value in (0, 1):
-            for _ in range(int(rng.integers(0, int(strength * self.holes) + 1))):
-                place = int(rng.integers(len(rows))) if len(rows) else 0
+            for _ in range(int(rng.integers(0, int(self.holes) + 1))):
+                centre = rng.random(2) * (width, height)
                 radii = np.maximum(strength * height * rng.uniform(*self.size, 2), 1)
-                angle, away = (
-                    rng.uniform(0, 180),
-                    rng.standard_normal(2) * (0 if value == 0 else 0.05 * height),
-                )
-                if value == 0 or rng.random() < 0.3:
-                    centre = np.rint((columns[place] + away[0], rows[place] + away[1])).astype(int).tolist()
-                    cv2.ellipse(moved, centre, np.rint(radii).astype(int).tolist(), angle, 0, 360, value, -1)
+                centre, axes = (np.rint(numbers).astype(int).tolist() for numbers in (centre, radii))
+                cv2.ellipse(moved, centre, axes, rng.uniform(0, 180), 0, 360, value, -1)
         if moved.any():
             photo.mask = moved

@@ -8,7 +8,7 @@ import numpy as np
 from datamodules.rgb.chain import ColourStep
 from datamodules.rgb.look import CHECKS, CLOUDS, DOTS, MATERIAL, PRINT, SPOTS, STRIPES, Look
 
-_DISPLAY_GAMMA = 2.2
+_DISPLAY_GAMMA = 2  # see `kernels.composed`
 _SKINS = (
     (0.96, 0.80, 0.70), (0.90, 0.70, 0.57), (0.78, 0.57, 0.43), (0.60, 0.41, 0.30), (0.38, 0.25, 0.18),
     (0.24, 0.16, 0.12),
@@ -21,7 +21,7 @@ _CLOTHES = ("shirt", "trousers", "inner", "shoes", "gloves", "socks", "belt")
 
 
 def _linear(colour: np.ndarray) -> np.ndarray:
-    return np.clip(colour, 0, 1) ** _DISPLAY_GAMMA
+    return np.maximum(np.minimum(colour, 0.97), 0.03) ** _DISPLAY_GAMMA
 
 
 def _from_hsv(hue: float, saturation: float, value: float) -> np.ndarray:
@@ -101,7 +101,7 @@ class Garments(ColourStep):
 
     Attributes:
         sleeves: Shares of no, short and long sleeves, relative to each other.
-        legs: Shares of short and long trousers, relative to each other.
+        shorts: Share of short trousers.
         dresses: Share of dresses, skirts and long shirts.
         jacket: Share of open jackets.
         belly: Share of short tops over bare skin.
@@ -113,7 +113,7 @@ class Garments(ColourStep):
     """
 
     sleeves: tuple[float, ...] = (0.15, 0.45, 0.4)
-    legs: tuple[float, ...] = (0.3, 0.7)
+    shorts: float = 0.3
     dresses: float = 0.12
     jacket: float = 0.15
     belly: float = 0.06
@@ -138,8 +138,7 @@ class Garments(ColourStep):
         self._cut_shirt(look, which[0], cuts, bare < self.bare)
         hem = -0.25 + 0.3 * cuts[4]
         look.cut(hem=hem, waist=hem + 0.02, belt=0.02 + 0.02 * cuts[5] if cuts[6] < 0.3 else 9)
-        legs = np.cumsum(self.legs) / sum(self.legs)
-        look.cut(trousers=0.3 + 0.8 * cuts[7] if which[1] < legs[0] else 1.75 + 0.4 * cuts[7])
+        look.cut(trousers=0.3 + 0.8 * cuts[7] if which[1] < self.shorts else 1.75 + 0.4 * cuts[7])
         if barefoot >= self.barefoot:
             look.cut(shoe=2.0 + 0.25 * cuts[8] - (0.7 * cuts[9] if cuts[10] < 0.15 else 0))
             look.cut(sock=2.0 - 0.5 * cuts[9] if cuts[10] > 0.5 else 9)
@@ -238,8 +237,8 @@ class Lights(ColourStep):
     """
 
     most: float = 3
-    ambient: tuple[float, float] = (0.12, 0.6)
-    key: tuple[float, float] = (0.2, 1.1)
+    ambient: tuple[float, float] = (0.2, 0.8)
+    key: tuple[float, float] = (0.3, 1.1)
     colour: float = 0.12
 
     def style(self, look: Look, rng: np.random.Generator, strength: float) -> None:

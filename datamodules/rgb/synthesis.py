@@ -30,7 +30,6 @@ from ljn.render import Renderer, get_renderer
 
 _LOOK, _PHOTO, _CROP, _BACKGROUND = 9, 10, 11, 12  # see datamodules.posing
 _FINER = 2  # times as many pixels along a side are rendered as the crop has
-_DISPLAY_GAMMA = 2.2
 
 
 @dataclass(frozen=True)
@@ -188,25 +187,18 @@ class RgbSynthesizer(BodySynthesizer):
             self.sensor.style(look, self._seed(key, _LOOK))
         fine = window.intrinsics(intrinsics, _FINER * width, _FINER * height)
         person, mask = self._render(vertices, gender, fine, look)
-        person, share = kernels.halved(person), kernels.halved(mask[..., None].astype(np.float32))
         behind = self.background.image(height, width, self._rng(key, _BACKGROUND))
-        shown = cv2.pow(person / np.maximum(share, 1e-6), 1 / _DISPLAY_GAMMA)
-        photo = Photo(np.clip(shown * share + behind * (1 - share), 0, 1), mask)
+        photo = Photo(kernels.composed(person, mask, behind), mask)
         if self.sensor is not None:
             self.sensor.photograph(photo, self._seed(key, _PHOTO))
-        crop = photo.rgb
-        if self.background.kind == "black":
-            crop = crop * kernels.halved(photo.mask[..., None].astype(np.float32))
-        crop = np.rint(255 * crop).astype(np.uint8).transpose(2, 0, 1)
+        crop = kernels.finished(photo.rgb, photo.mask, self.background.kind == "black")
         own = window.intrinsics(intrinsics, width, height)
         if variation.is_mirrored:
             crop, own[2] = crop[..., ::-1], width - 1 - own[2]
         return np.ascontiguousarray(crop), own
 
     def _window(self, vertices: np.ndarray, intrinsics: np.ndarray, variation: _Variation) -> Window:
-        pixels = vertices[:, :2] / vertices[:, 2:] * intrinsics[:2] + intrinsics[2:]
-        (left, top), (right, bottom) = np.ceil(pixels.min(0)), np.floor(pixels.max(0))
-        left, top, width, height = body_window(left, right, top, bottom, self.recipe)
+        left, top, width, height = body_window(*kernels.image_box(vertices, intrinsics), self.recipe)
         across, down = width * variation.scale, height * variation.scale
         left += (width - across) / 2 + variation.shift[0] * across
         top += (height - down) / 2 + variation.shift[1] * down
@@ -224,12 +216,15 @@ class RgbSynthesizer(BodySynthesizer):
         sheared = vertices.copy()
         sheared[:, 0] += vertices[:, 2] * ((cx - camera.cx) / fx)
         sheared[:, 1] += vertices[:, 2] * ((cy - camera.cy) / fy)
-        seen = self._renderer.fragments(torch.from_numpy(sheared)[None], self._smpl.faces, camera)
+        normals = kernels.vertex_normals(vertices.astype(np.float32), surface.faces)
+        facing = kernels.facing(sheared, surface.faces)
+        surface = surface._replace(faces=surface.faces[facing], regions=surface.regions[facing])
+        seen = self._renderer.fragments(
+            torch.from_numpy(sheared)[None], torch.from_numpy(surface.faces), camera
+        )
         face_ids = seen.face_ids[0].numpy()
         image = kernels.paint(
-            face_ids,
-            seen.barycentrics[0].numpy(),
-            kernels.vertex_normals(vertices.astype(np.float32), surface.faces),
+            *(face_ids, seen.barycentrics[0].numpy(), normals),
             *surface,
             *(
                 look.colours,
