@@ -10,8 +10,8 @@ import numpy as np
 import torch
 
 from ljn.body.skeleton import ROOT
-from ljn.geometry.camera import Camera, place_at_root, project
-from ljn.geometry.rotations import CAMERA_FROM_BODY, rotmat_to_rotvec, rotvec_to_rotmat
+from ljn.geometry.camera import Camera, project
+from ljn.geometry.rotations import rotvec_to_rotmat
 from ljn.pipeline.keypoints import Keypoints
 from ljn.pipeline.pipeline import Pipeline
 from ljn.pipeline.prediction import Prediction
@@ -121,6 +121,7 @@ class ArSystem:
         observed = self.pipeline.observe_body(depth, self.camera, keypoints)
         return self.pipeline.predict([observed._replace(report=report)])[0]
 
+    @torch.inference_mode()
     def _smoothed(self, prediction: Prediction, seconds: float) -> Prediction:
         """A prediction smoothed over the frames before, its mesh made anew."""
         last, self._last_s = self._last_s, seconds
@@ -131,35 +132,20 @@ class ArSystem:
             last = seconds - 1 / _FPS
         values = {"joints": torch.from_numpy(prediction.joints)}
         if prediction.pose is not None and prediction.mesh_joints is not None:
+            rotvecs = torch.from_numpy(prediction.pose).unflatten(-1, (-1, 3))
             values |= {
                 "root": torch.from_numpy(prediction.mesh_joints[ROOT]),
-                "rotmats": rotvec_to_rotmat(torch.from_numpy(prediction.pose).unflatten(-1, (-1, 3))),
+                "rotmats": rotvec_to_rotmat(rotvecs),
                 "betas": torch.from_numpy(prediction.betas),
             }
         smoothed = self.smoother(values, seconds - last)
         made = {"joints": smoothed["joints"].numpy()}
-        if "rotmats" in smoothed:
-            made |= self._meshed(smoothed["root"], smoothed["rotmats"], smoothed["betas"])
+        if self.pipeline.regressor is not None:
+            device = self.pipeline.regressor.module.device
+            parameters = [smoothed[name][None].to(device) for name in ("rotmats", "betas", "root")]
+            meshes = self.pipeline.meshes(*parameters)
+            made |= {name: value[0].cpu().numpy() for name, value in meshes.items() if name != "faces"}
         return replace(prediction, **made)
-
-    @torch.inference_mode()
-    def _meshed(
-        self, root: torch.Tensor, rotmats: torch.Tensor, betas: torch.Tensor
-    ) -> dict[str, np.ndarray]:
-        """A prediction's arrays of the mesh with such a root `(3,)`, rotations `(24, 3, 3)` and shape `(10,)`."""
-        assert self.pipeline.regressor is not None
-        module = self.pipeline.regressor.module
-        body = module.body.from_rotmats(rotmats[None].to(module.device), betas[None].to(module.device))
-        vertices, joints = body.vertices[0].cpu(), body.joints[0].cpu()
-        made = {
-            "vertices": place_at_root(vertices, joints[ROOT], root),
-            "mesh_joints": place_at_root(joints, joints[ROOT], root),
-            "pose": rotmat_to_rotvec(rotmats).flatten(-2),
-            "betas": betas,
-            "global_orient": rotmat_to_rotvec(CAMERA_FROM_BODY.to(rotmats) @ rotmats[0]),
-            "transl": root - joints[ROOT],
-        }
-        return {name: value.float().numpy() for name, value in made.items()}
 
 
 class _Watch:
