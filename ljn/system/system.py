@@ -1,7 +1,7 @@
 """The AR system: a frame of depth and colour in, mask, 2D joints, joints and mesh out, one after another."""
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -113,6 +113,32 @@ class ArSystem:
         except ValueError as error:
             return ArResult(frame, None, mask, str(error), "", report.facts, report.warnings, watch.seconds)
         return ArResult(frame, prediction, mask, None, flip, report.facts, report.warnings, watch.seconds)
+
+    @property
+    def state(self) -> dict[str, np.ndarray]:
+        """What it remembers of the frames before, as arrays by name: to go on from."""
+        state = {} if self._last_s is None else {"last_s": np.array(self._last_s)}
+        if self.judge is not None and self.judge.joints is not None:
+            state |= {
+                "judge_joints": self.judge.joints,
+                "judge_seconds": np.array(self.judge.seconds),
+                "judge_corrected": np.array(self.judge.num_corrected),
+            }
+        if self.smoother is not None:
+            state |= {f"smoother_{name}": value for name, value in self.smoother.state.items()}
+        return state
+
+    @state.setter
+    def state(self, state: Mapping[str, np.ndarray]) -> None:
+        self._last_s = float(state["last_s"]) if "last_s" in state else None
+        if self.judge is not None and "judge_joints" in state:
+            numbers = float(state["judge_seconds"]), int(state["judge_corrected"])
+            self.judge = FlipJudge(state["judge_joints"], *numbers)
+        if self.smoother is not None:
+            start = "smoother_"
+            self.smoother.state = {
+                name.removeprefix(start): value for name, value in state.items() if name.startswith(start)
+            }
 
     def _from_joints(self, depth: np.ndarray, joints: np.ndarray, report: Report) -> Prediction:
         """The prediction that begins with the image of joints `(24, 3)`, as if it were given as keypoints."""
