@@ -45,7 +45,8 @@ class SynthesisSettings:
     """How a pose becomes a sample.
 
     Attributes:
-        heading: `histogram`, `uniform` or `source`; see `draw_heading`.
+        heading: `histogram`, `uniform` or `source`; see `draw_heading`. All but `source` take the place of a heading
+            that was recorded.
         distance_m: Range of the depth of the body's centre, metres.
         margin_px: Clear border around the body, pixels.
         depth_noise_m: Standard deviation of the depth noise of the sensor `gaussian`, metres; others have their own.
@@ -151,7 +152,7 @@ class DepthSynthesizer:
                 "heading: these poses carry no heading of their own; use 'histogram' or 'uniform'"
             )
         check_margin(settings.smallest(camera), settings.margin_px)
-        self.records = records
+        self.records = records if settings.heading == "source" else records.without_heading()
         self.bodies = bodies
         self.camera = camera
         self.settings = settings

@@ -12,6 +12,7 @@ class Clearance:
     """Measures poses on a body's mean shape and on the reference skeleton."""
 
     def __init__(self, body: BodyModel) -> None:
+        self.hash = body.hash
         self.offsets = joint_offsets(body)
         self._capsules = fit_capsules(body)
 

@@ -17,7 +17,8 @@ _OF_BODY = {
     "body.predicted": ("module.predicted",),
 }
 _MISSING = object()
-_SENSOR = "data/sensor="
+_CHOICES = ("data/source", "data/sensor")
+"""The groups of which an evaluation can choose another file than its training."""
 
 
 def typed_overrides() -> list[str]:
@@ -28,8 +29,9 @@ def typed_overrides() -> list[str]:
 def with_checkpoint_config(cfg: DictConfig, checkpoint: Checkpoint, overrides: list[str]) -> DictConfig:
     """The call's configuration with the checkpoint's model, data and trainer, and the overrides on top.
 
-    Of the checkpoint's groups, the keys that `ljn.runs.keys` gives to the machine or the call have this call's values;
-    and with `data/sensor=NAME` the data has that chain of steps, its cameras as they are.
+    Of the checkpoint's groups, the keys that `ljn.runs.keys` gives to the machine or the call have this call's values.
+    With `data/source=NAME` poses are of that source, with the checkpoint's bodies; with `data/sensor=NAME` the data has
+    that chain of steps, its cameras as they are.
 
     Raises:
         ValueError: An override is about something that the checkpoint decides.
@@ -38,10 +40,10 @@ def with_checkpoint_config(cfg: DictConfig, checkpoint: Checkpoint, overrides: l
     plain |= {name: _with_call(checkpoint.config[name], plain[name], name) for name in CONFIG_GROUPS}
     merged = OmegaConf.create(plain)
     OmegaConf.set_struct(merged, True)
-    single = [line for line in overrides if not line.startswith(_SENSOR)]
-    if len(single) < len(overrides):
-        OmegaConf.update(merged, "data.sensor", cfg.data.sensor, merge=False, force_add=True)
-    apply_overrides(merged, single)
+    chosen = {line for line in overrides if line.partition("=")[0] in _CHOICES}
+    for key in {key_of(line) for line in chosen}:
+        OmegaConf.update(merged, key, OmegaConf.select(cfg, key), merge=False, force_add=True)
+    apply_overrides(merged, [line for line in overrides if line not in chosen])
     return merged
 
 
@@ -88,7 +90,8 @@ def _set(cfg: DictConfig, key: str, value: Any, line: str) -> None:
         known = ", ".join(sorted(str(name) for name in parent)) if isinstance(parent, DictConfig) else "none"
         raise ValueError(f"{line}: the checkpoint's config has no key '{key}'; known there: {known}")
     OmegaConf.update(cfg, key, value)
-    for derived in _OF_BODY.get(key, ()):
+    mixed = OmegaConf.select(cfg, "data.source.sources", default={}) if key == "body.genders" else {}
+    for derived in (*_OF_BODY.get(key, ()), *(f"data.source.sources.{name}.genders" for name in mixed)):
         if OmegaConf.select(cfg, derived, default=_MISSING) is not _MISSING:
             OmegaConf.update(cfg, derived, value)
 
