@@ -139,6 +139,12 @@ def find_frames(
     ]
 
 
+def in_order(name: str) -> list[tuple[int, str]]:
+    """What to sort a frame's name by, so that `frame_9` comes before `frame_10`."""
+    parts = re.split(r"([0-9]+)", name)
+    return [(int(part), "") if part.isascii() and part.isdigit() else (-1, part) for part in parts]
+
+
 def _keypoint_files(folder: Path, stems: Sequence[str]) -> dict[str, Path]:
     """The file of each depth image's keypoints, by stem; where there is none, that which would be read first."""
     names = {path.name for path in folder.iterdir() if path.suffix == ".json"}
