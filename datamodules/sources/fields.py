@@ -44,7 +44,7 @@ def pose_of(values: np.ndarray, name: str = "poses") -> np.ndarray:
     if values.dtype.kind not in "fiu":
         raise ValueError(f"{name}: expected numbers, got {values.dtype}")
     if values.ndim == 3 and values.shape[2] == 3:
-        values = values.reshape(len(values), -1)
+        values = values.reshape(len(values), 3 * values.shape[1])
     if values.ndim != 2 or values.shape[1] not in _WIDTHS:
         widths = ", ".join(map(str, _WIDTHS))
         raise ValueError(
