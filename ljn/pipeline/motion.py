@@ -14,7 +14,7 @@ import torch
 from ljn.body.skeleton import BONES, JOINT_NAMES, NUM_JOINTS, PARENTS, ROOT
 from ljn.body.smpl import SMPL
 from ljn.geometry.rotations import BODY_TO_OPENGL, CAMERA_FROM_BODY, rotmat_to_euler, rotvec_to_rotmat
-from ljn.pipeline.pipeline import Prediction
+from ljn.pipeline.prediction import Prediction
 
 _AMASS_WIDTH = 156  # of SMPL-H's 52 joints
 _AMASS_BODY = 66  # of those that are SMPL's, too: all but its two hands, whose rotations are left out

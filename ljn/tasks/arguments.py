@@ -8,14 +8,15 @@ from pathlib import Path
 from hydra.core.override_parser.types import Quote, QuotedString
 
 _SHORT = {
-    **dict.fromkeys(("input", "camera", "keypoints", "mask"), ("task=predict",)),
+    **dict.fromkeys(("input", "camera", "keypoints", "mask", "rgb"), ("task=predict",)),
+    "keypoint_detector": ("task=predict", "task=package", "task=benchmark"),
     "mesh_ckpt_path": ("task=predict", "task=demo", "task=package", "task=benchmark"),
 }
 """Keys of tasks that may be typed without their `task.`, and the tasks that they are of."""
 _PATHS = (
     *(f"task.{name}" for name in (*_SHORT, "directory")),
     *("ckpt_path", "weights", "paths.output_dir", "paths.cache_dir", "body.path"),
-    *("data.detector_ckpt", "bench.path", "bench.samples.path"),
+    *("data.detector_ckpt", "data.keypoint_ckpt", "bench.path", "bench.samples.path"),
 )
 _OF_SOURCE = re.compile(r"data\.source\.(sources\.\w+\.)?(path|split_path|splits|skeleton)")
 """The paths of sources, also of those that are mixed."""

@@ -21,7 +21,8 @@ from ljn.pipeline.frames import FrameFiles, find_frames, in_order, predict_frame
 from ljn.pipeline.inputs import read_camera
 from ljn.pipeline.motion import WRITERS, PosedFrame, body_motion, shape_distance_mm
 from ljn.pipeline.pictures import draw_prediction
-from ljn.pipeline.pipeline import Pipeline, Prediction
+from ljn.pipeline.pipeline import Pipeline
+from ljn.pipeline.prediction import Prediction
 from ljn.pipeline.report import Report
 from ljn.pipeline.writing import write_arrays, write_mesh
 from ljn.refinement import chosen_settings
@@ -36,7 +37,7 @@ _SEQUENCE = "sequence"
 _WRITTEN = (".npz", ".ply", ".glb", ".png", *(suffix for suffix, _ in WRITERS.values()))
 _NEEDED = ("task.input", "task.camera")
 _CHECKPOINTS = ("ckpt_path", "task.mesh_ckpt_path")
-_OPTIONAL = ("task.keypoints", "task.mask")
+_OPTIONAL = ("task.keypoints", "task.mask", "task.rgb", "task.keypoint_detector")
 _COMMAND = (
     "python run.py task=predict task.input=DEPTH.png task.camera=CAMERA.yaml task.keypoints=KEYPOINTS.json "
     "ckpt_path=DETECTOR.ckpt task.mesh_ckpt_path=MESH.ckpt"
@@ -75,7 +76,7 @@ def predict(cfg: DictConfig) -> dict[str, float]:
             got = "null" if value is None else f"{value!r}, no text: write '{key}=\"PATH\"'"
             raise ValueError(f"{key}: expected a path, got {got}; {_COMMAND}")
     camera = read_camera(task.camera)
-    frames = find_frames(task.input, task.keypoints, task.mask, task.mask_id)
+    frames = find_frames(task.input, task.keypoints, task.mask, task.mask_id, task.rgb)
     forms = _sequence_forms(task)
     if forms:
         frames.sort(key=lambda frame: in_order(frame.name))
@@ -90,10 +91,13 @@ def predict(cfg: DictConfig) -> dict[str, float]:
     use_gpu = cfg.trainer.accelerator != "cpu" and torch.cuda.is_available()
     device = "cuda" if use_gpu else "cpu"
     if package:
-        pipeline = Pipeline.from_pretrained(package, device, cfg.body.path, cfg.refine, task.strict)
+        pipeline = Pipeline.from_pretrained(
+            package, device, cfg.body.path, cfg.refine, task.strict, task.keypoint_detector
+        )
     else:
         pipeline = Pipeline.load(
-            cfg.ckpt_path, task.mesh_ckpt_path, device, cfg.body.path, cfg.refine, task.strict
+            *(cfg.ckpt_path, task.mesh_ckpt_path, device, cfg.body.path, cfg.refine, task.strict),
+            task.keypoint_detector,
         )
     if task.keypoints is None and pipeline.needs_keypoints:
         raise ValueError(
@@ -103,6 +107,11 @@ def predict(cfg: DictConfig) -> dict[str, float]:
     if forms and pipeline.regressor is None:
         raise ValueError(
             "task.sequence: a motion is of meshes, and there is no mesh regressor; give task.mesh_ckpt_path=MESH.ckpt"
+        )
+    if task.keypoints is None and task.rgb is None and pipeline.finder and pipeline.finder.sees == "rgb":
+        raise ValueError(
+            f"task.rgb: expected a path, since the keypoint detector '{task.keypoint_detector}' finds keypoints in the "
+            "colour image, got null; add rgb=IMAGE.png, registered to the depth image"
         )
 
     results, posed = _predict(pipeline, frames, camera, directory, may_fail=Path(task.input).is_dir())
@@ -117,6 +126,7 @@ def predict(cfg: DictConfig) -> dict[str, float]:
         "predict/doubtful": sum(bool(result.get("warnings")) for result in results.values()),
         "detector": pipeline.detector.origin,
         "regressor": pipeline.regressor.origin if pipeline.regressor else None,
+        "keypoint_detector": pipeline.finder.stage.origin if pipeline.finder else None,
         "refine": chosen_settings(cfg.refine),
         "camera": asdict(camera),
         "frames": results,

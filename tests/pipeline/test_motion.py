@@ -8,7 +8,7 @@ from ljn import SMPL
 from ljn.body.skeleton import JOINT_NAMES, ROOT
 from ljn.geometry.rotations import CAMERA_FROM_BODY
 from ljn.pipeline.motion import PosedFrame, body_motion, shape_distance_mm, write_amass, write_bvh
-from ljn.pipeline.pipeline import Prediction
+from ljn.pipeline.prediction import Prediction
 
 RATE_HZ = 25
 
