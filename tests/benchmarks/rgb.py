@@ -84,7 +84,9 @@ def draw() -> Image.Image:
         label = Image.new("RGB", (sheet.shape[1], LABEL), "white")
         ImageDraw.Draw(label).text((4, 2), name, fill="black", font=ImageFont.load_default(12))
         blocks += [np.asarray(label), sheet]
-    return Image.fromarray(np.concatenate(blocks)).quantize(256)
+    return Image.fromarray(
+        np.concatenate(blocks)
+    )  # in all its colours: fewer would look like faults of the crops
 
 
 def main() -> None:
