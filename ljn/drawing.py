@@ -172,7 +172,7 @@ class CropSample(NamedTuple):
     title: str  # text above it
 
 
-def draw_crops(samples: list[CropSample], num_columns: int) -> "Figure":
+def draw_keypoints(samples: list[CropSample], num_columns: int) -> "Figure":
     """A page of crops in reading order with true (blue) and predicted (red) skeletons; the left side's are thick."""
     num_rows = -(-len(samples) // num_columns)
     figure, axes = _page(len(samples), num_columns, 1, 2.6 * num_columns, 2.9 * num_rows + 0.3)

@@ -9,7 +9,16 @@ import numpy as np
 from ljn.report.markup import cell, column, facts, section, table
 from ljn.report.style import STYLE
 
-STAGES = ("reading", "segmentation", "2D joints", "joints and mesh", "flips", "smoothing", "overlay", "writing")
+STAGES = (
+    "reading",
+    "segmentation",
+    "2D joints",
+    "joints and mesh",
+    "flips",
+    "smoothing",
+    "overlay",
+    "writing",
+)
 
 
 def summarise(frames: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
@@ -52,7 +61,9 @@ def summarise(frames: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     return made
 
 
-def page(title: str, summary: Mapping[str, Any], frames: Sequence[Mapping[str, Any]], files: Sequence[str]) -> str:
+def page(
+    title: str, summary: Mapping[str, Any], frames: Sequence[Mapping[str, Any]], files: Sequence[str]
+) -> str:
     """The page: the video, the numbers, what became of the frames that failed or were doubted.
 
     Args:
@@ -86,7 +97,7 @@ def page(title: str, summary: Mapping[str, Any], frames: Sequence[Mapping[str, A
     head = [[column("stage", "text"), column("frames/s"), column("ms")]]
     parts.append(section("speed", "Speed", table("speed", head, rates)))
     told = [
-        f'<tr>{cell(str(frame["number"]), "text")}{cell(escape(frame["name"]), "text")}'
+        f"<tr>{cell(str(frame['number']), 'text')}{cell(escape(frame['name']), 'text')}"
         f"{cell(escape(_told(frame)), 'text')}</tr>"
         for frame in frames
         if _told(frame)
