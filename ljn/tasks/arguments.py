@@ -8,9 +8,10 @@ from pathlib import Path
 from hydra.core.override_parser.types import Quote, QuotedString
 
 _SHORT = {
-    **dict.fromkeys(("input", "camera", "keypoints", "mask", "rgb"), ("task=predict",)),
-    "keypoint_detector": ("task=predict", "task=package", "task=benchmark"),
-    "mesh_ckpt_path": ("task=predict", "task=demo", "task=package", "task=benchmark"),
+    **dict.fromkeys(("input", "camera"), ("task=predict", "task=ar")),
+    **dict.fromkeys(("keypoints", "mask", "rgb"), ("task=predict",)),
+    "keypoint_detector": ("task=predict", "task=ar", "task=package", "task=benchmark"),
+    "mesh_ckpt_path": ("task=predict", "task=ar", "task=demo", "task=package", "task=benchmark"),
 }
 """Keys of tasks that may be typed without their `task.`, and the tasks that they are of."""
 _PATHS = (

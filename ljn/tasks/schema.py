@@ -24,6 +24,8 @@ class Config:
     task: Any = None
     bench: Any = None
     predictor: Any = None
+    recording: Any = None
+    segmentation: Any = None
     preset: Any = None
     data: Any = None
     body: Any = None
