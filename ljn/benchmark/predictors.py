@@ -174,9 +174,7 @@ class LiftedKeypoints:
     reads = ("keypoints",)
     is_on_surface = True
 
-    def __init__(
-        self, keypoint_detector: str | Path | None = None, name: str = "lifted keypoints"
-    ) -> None:
+    def __init__(self, keypoint_detector: str | Path | None = None, name: str = "lifted keypoints") -> None:
         self.name = name
         self.finder = None if keypoint_detector is None else KeypointFinder.load(keypoint_detector)
         self.needs_keypoints = self.finder is None

@@ -4,6 +4,7 @@ import hashlib
 import logging
 import os
 import time
+from contextlib import nullcontext
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -28,6 +29,7 @@ from ljn.system.store import Store
 from ljn.system.summary import page, summarise
 from ljn.system.system import ArResult, ArSystem
 from ljn.system.video import write_video
+from ljn.system.view import WebView
 from ljn.tasks.package import chosen_package
 from ljn.tasks.validation import check_writable
 
@@ -150,7 +152,12 @@ def _run(system: ArSystem, recording: Any, store: Store, task: DictConfig) -> No
         return
     has_truth = hasattr(recording, "truth")
     begin = time.perf_counter()
-    with tqdm(total=total, initial=done, unit="frame") as progress:
+    with (
+        tqdm(total=total, initial=done, unit="frame") as progress,
+        WebView(recording.camera, task.port) if task.view else nullcontext() as view,
+    ):
+        if view is not None:
+            progress.write(f"live view: {view.url}")
         for frame in recording.frames(done):
             reading = time.perf_counter() - begin
             truth = recording.truth(frame.number) if has_truth else None
@@ -160,6 +167,8 @@ def _run(system: ArSystem, recording: Any, store: Store, task: DictConfig) -> No
             picture = draw_overlay(result, recording.camera)
             result.seconds.update({"reading": reading, "overlay": time.perf_counter() - begin})
             about = _about(result, truth, recording)
+            if view is not None:
+                view.show(result, picture)
             store.write(result, picture, system.state, about)
             progress.update()
             if total is not None and frame.number + 1 >= total:
