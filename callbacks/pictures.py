@@ -16,7 +16,7 @@ from torch import Tensor
 from callbacks.gathering import gather_samples, join_batches
 from ljn.body.skeleton import ROOT
 from ljn.data import Batch
-from ljn.drawing import CropSample, MeshSample, Sample, clouds, draw_crops, draw_meshes, draw_samples
+from ljn.drawing import CropSample, MeshSample, Sample, clouds, draw_keypoints, draw_meshes, draw_samples
 from ljn.geometry.camera import place_at_root, project, transfer
 from ljn.metrics.functional import mpjpe
 from ljn.runs import layout
@@ -227,4 +227,4 @@ class KeypointPictures(Pictures):
         images = samples["rgb"].permute(0, 2, 3, 1) if "rgb" in samples else samples["crop"]
         keypoints, pred_keypoints = samples["keypoints"].numpy(), samples["pred_keypoints"].numpy()
         rows = zip(images.numpy(), keypoints, pred_keypoints, titles)
-        return draw_crops([CropSample(*row) for row in rows], num_columns)
+        return draw_keypoints([CropSample(*row) for row in rows], num_columns)

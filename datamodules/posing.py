@@ -99,7 +99,7 @@ class BodySynthesizer(ABC):
                 "heading: these poses carry no heading of their own; use 'histogram' or 'uniform'"
             )
         check_margin(smallest_camera(camera, settings), settings.margin_px)
-        self.records = records
+        self.records = records if settings.heading == "source" else records.without_heading()
         self.bodies = bodies
         self.camera = camera
         self.placing = settings

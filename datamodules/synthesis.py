@@ -41,7 +41,8 @@ class SynthesisSettings:
     """How a pose becomes a sample.
 
     Attributes:
-        heading: `histogram`, `uniform` or `source`; see `draw_heading`.
+        heading: `histogram`, `uniform` or `source`; see `draw_heading`. All but `source` take the place of a heading
+            that was recorded.
         distance_m: Range of the depth of the body's centre, metres.
         margin_px: Clear border around the body, pixels.
         depth_noise_m: Standard deviation of the depth noise of the sensor `gaussian`, metres; others have their own.

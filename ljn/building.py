@@ -14,7 +14,7 @@ from ljn.reading import brief, reason
 
 OWN_MODULES = (
     "ljn.nets.", "ljn.modules.", "ljn.geometry.camera.", "ljn.cloud.observation.", "ljn.cloud.rgb.",
-    "ljn.benchmark.", "datamodules.", "callbacks.",
+    "ljn.benchmark.", "ljn.system.", "datamodules.", "callbacks.",
 )  # fmt: skip
 """The modules whose classes a config may name."""
 _FOREIGN_BASES = {

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ljn.body.skeleton import BONES, JOINT_NAMES
-from ljn.geometry.camera import Camera, back_project
+from ljn.geometry.camera import Camera, back_project, project
 from ljn.render.shading import shade_mesh
 
 if TYPE_CHECKING:
@@ -172,7 +172,7 @@ class CropSample(NamedTuple):
     title: str  # text above it
 
 
-def draw_crops(samples: list[CropSample], num_columns: int) -> "Figure":
+def draw_keypoints(samples: list[CropSample], num_columns: int) -> "Figure":
     """A page of crops in reading order with true (blue) and predicted (red) skeletons; the left side's are thick."""
     num_rows = -(-len(samples) // num_columns)
     figure, axes = _page(len(samples), num_columns, 1, 2.6 * num_columns, 2.9 * num_rows + 0.3)
@@ -223,4 +223,17 @@ def draw_examples(batch: "Batch", depth: Tensor) -> "Figure":
         sample = Sample(points, arrays["joints"][number], arrays["initial_joints"][number], "")
         _draw_view(front, sample, horizontal=0)
         _draw_view(side, sample, horizontal=2)
+    return figure
+
+
+def draw_crops(batch: "Batch") -> "Figure":
+    """A page of B colour crops, eight a row, each beside itself with its true joints."""
+    number, columns = len(batch["rgb"]), 8
+    figure, axes = _page(number, columns, 2, 2.0 * columns, 1.6 * -(-number // columns))
+    keypoints = project(batch["joints"], batch["rgb_camera"]).numpy()
+    for (plain, marked), crop, joints in zip(axes, batch["rgb"].permute(0, 2, 3, 1).numpy(), keypoints):
+        for axis in (plain, marked):
+            axis.imshow(crop)
+        marked.plot(*bone_lines(joints).T, color=_TRUE, lw=1.0, marker=".", ms=3)
+        marked.set(xlim=plain.get_xlim(), ylim=plain.get_ylim())
     return figure

@@ -38,3 +38,8 @@ def import_pyrender() -> Any:
         "data.synthesis.renderer=zbuffer"
     )
     return _import("pyrender", fix)
+
+
+def import_viser() -> Any:
+    """The `viser` module; an `ImportError` where it is missing."""
+    return _import("viser", "-e '.[view]'`; or do without the live view: task.view=false")

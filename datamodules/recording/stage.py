@@ -134,13 +134,13 @@ class _Cloth:
         y = np.arange(self.top_m, floor_m, _CELL_M, dtype=np.float32)[:, None]
         self._origin = x[0], y[0, 0]
         wander, bend = rng.uniform(0, 2 * np.pi, (2, 4))
-        phase: np.ndarray = 2 * np.pi * x / curtain.fold_m
+        phase = 2 * np.pi * x / curtain.fold_m
         for k in range(4):
             phase = phase + rng.uniform(0.5, 1.2) * np.cos((1.1 + 1.7 * k) * x + wander[k])
             phase = phase + rng.uniform(0.05, 0.3) * np.cos((0.6 + k) * y + 0.8 * k * x + bend[k])
         pleats = (0.5 + 0.5 * np.cos(phase)) ** 0.8
         deep = 0.65 + 0.35 * np.cos(2.3 * x + wander[0] + 0.4 * y) * (0.6 + 0.4 * (y - self.top_m) / 3.0)
-        height: np.ndarray = curtain.folds_m * pleats * deep
+        height = curtain.folds_m * pleats * deep
         for _ in range(_WAVES):
             angle, length = rng.uniform(0, np.pi), np.exp(rng.uniform(np.log(0.1), np.log(0.9)))
             across = (np.cos(angle) * x + np.sin(angle) * y) * (2 * np.pi / length)
@@ -162,7 +162,7 @@ class _Cloth:
 
     def meet(self, ray_x: np.ndarray, ray_y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Depth `(H, W)` where rays meet it, its colour `(H, W, 3)` there, and whether they do `(H, W)`."""
-        z = np.full(ray_x.shape, self.behind_m, np.float32)
+        z: np.ndarray = np.full(ray_x.shape, self.behind_m, np.float32)
         for _ in range(4):  # folds are shallow: it converges
             z = self.behind_m + self._at(self._height, ray_x * z, ray_y * z)
         x, y = ray_x * z, ray_y * z

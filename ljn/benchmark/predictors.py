@@ -22,6 +22,7 @@ import numpy as np
 from ljn.benchmark.frames import BenchFrame
 from ljn.body.skeleton import NUM_JOINTS
 from ljn.cloud.lifting import lift_keypoints
+from ljn.pipeline.keypoint_finder import KeypointFinder
 from ljn.pipeline.keypoints import Keypoints, fill_missing
 from ljn.pipeline.person import find_person
 from ljn.pipeline.pipeline import Pipeline
@@ -162,19 +163,31 @@ class PipelinePredictor:
 
 
 class LiftedKeypoints:
-    """The baseline: 2D keypoints with the depth at their pixels, those that are missing filled in before."""
+    """The baseline: 2D keypoints with the depth at their pixels, those that are missing filled in before.
 
-    name = "lifted keypoints"
+    Args:
+        keypoint_detector: Finds the keypoints of frames that have none; see `KeypointFinder.load`. None: there have to
+            be some.
+        name: For tables.
+    """
+
     reads = ("keypoints",)
-    needs_keypoints = True
     is_on_surface = True
-    fingerprint = "lifted keypoints 1"
+
+    def __init__(self, keypoint_detector: str | Path | None = None, name: str = "lifted keypoints") -> None:
+        self.name = name
+        self.finder = None if keypoint_detector is None else KeypointFinder.load(keypoint_detector)
+        self.needs_keypoints = self.finder is None
+        found = "" if self.finder is None else f" {self.finder.stage.origin['hash']}"
+        self.fingerprint = f"lifted keypoints 1{found}"
 
     def __call__(self, frames: Sequence[BenchFrame]) -> np.ndarray:
         """See `Predictor`."""
         lifted = []
         for frame in frames:
             keypoints = _filled(frame.keypoints)
+            if keypoints is None and self.finder is not None:
+                keypoints = self.finder(find_person(frame.depth, frame.camera).depth, frame.camera)
             if keypoints is None:
                 raise ValueError("keypoints: expected those of every frame, got none")
             lifted.append(lift_keypoints(keypoints.positions, frame.depth, frame.camera))

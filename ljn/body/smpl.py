@@ -128,6 +128,11 @@ class SMPL(nn.Module):
         vertices, joints = self._by_gender(self._pose, gender, betas, rotmats.flatten(-3))
         return SMPLOutput(vertices, joints)
 
+    @property
+    def skinning_weights(self) -> Tensor:
+        """`(V, 24)`, how much each joint moves a vertex, of the first gender's body."""
+        return self._weights[0].T
+
     def rest_joints(self, betas: Tensor, gender: Tensor | None = None) -> Tensor:
         """The joints J(beta) of the unposed body, `(..., 24, 3)`, metres, SMPL's rest frame; see `forward`."""
         _check_shape("betas", betas, betas.shape[:-1], NUM_BETAS)

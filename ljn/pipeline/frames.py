@@ -148,6 +148,12 @@ def find_frames(
     ]
 
 
+def in_order(name: str) -> list[tuple[int, str]]:
+    """What to sort a frame's name by, so that `frame_9` comes before `frame_10`."""
+    parts = re.split(r"([0-9]+)", name)
+    return [(int(part), "") if part.isascii() and part.isdigit() else (-1, part) for part in parts]
+
+
 def _rgb_file(folder: Path, stem: str) -> Path:
     """The colour image of a depth image; where there is none, that which would be read first."""
     choices = [folder / f"{stem}{suffix}" for suffix in RGB_SUFFIXES]

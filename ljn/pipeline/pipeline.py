@@ -319,7 +319,7 @@ class Pipeline:
 
         rotmats, betas = regress(_on(regressor.device, seen) | {"initial_joints": joints})
         root = joints[:, ROOT]
-        made = {}
+        made: dict[str, torch.Tensor] = {}
         if self.refiner is not None:
             detector = self.detector.module
             # A second look at points alone would be at those of the detector's recipe.
@@ -331,18 +331,32 @@ class Pipeline:
             )
             rotmats, betas, root = refined.rotmats, refined.betas, refined.root
             made = {"is_refined": refined.is_kept, "residual_mm": refined.residual_mm}
-        body = regressor.body.from_rotmats(rotmats, betas)
-        made |= {
+        made |= self.meshes(rotmats, betas, root)
+        return made, joints
+
+    def meshes(
+        self, rotmats: torch.Tensor, betas: torch.Tensor, root: torch.Tensor
+    ) -> dict[str, torch.Tensor]:
+        """The arrays of a `Prediction` that are of its mesh, from its parameters, all on the regressor's device.
+
+        Args:
+            rotmats: `(B, 24, 3, 3)`, the joints' rotations; the first leads from SMPL's rest frame to body world.
+            betas: `(B, 10)`.
+            root: `(B, 3)`, the root joint, metres, camera frame.
+        """
+        assert self.regressor is not None
+        layer = self.regressor.module.body
+        body = layer.from_rotmats(rotmats, betas)
+        return {
             "vertices": place_at_root(body.vertices, body.joints[:, ROOT], root),
             "mesh_joints": place_at_root(body.joints, body.joints[:, ROOT], root),
             "pose": rotmat_to_rotvec(rotmats).flatten(-2),
             "betas": betas,
             "global_orient": rotmat_to_rotvec(CAMERA_FROM_BODY.to(rotmats) @ rotmats[:, 0]),
-            "transl": root
-            - body.joints[:, ROOT],  # an SMPL layer turns a body about its root, and then moves it
-            "faces": regressor.body.faces,
+            # An SMPL layer turns a body about its root, and then moves it.
+            "transl": root - body.joints[:, ROOT],
+            "faces": layer.faces,
         }
-        return made, joints
 
 
 def _on(device: torch.device, tensors: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:

@@ -68,7 +68,9 @@ KEYS: dict[str, Key] = {
     "preset": Key.THROUGH,
     "optimized_metric": Key.THROUGH | Key.ONE_STAGE,
     "task": Key.TASK,
-    **dict.fromkeys(("ckpt_path", "weights", "refine", "bench", "predictor", "recording"), Key.TASK),
+    **dict.fromkeys(
+        ("ckpt_path", "weights", "refine", "bench", "predictor", "recording", "segmentation"), Key.TASK
+    ),
     "num_threads": Key.MACHINE,
     **dict.fromkeys(("tags", "group", "tables", "rerun", "logger", "paths", "hydra", "local"), Key.CALL),
     "body": Key.THROUGH | Key.CHANGEABLE,

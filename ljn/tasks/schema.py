@@ -25,6 +25,7 @@ class Config:
     bench: Any = None
     predictor: Any = None
     recording: Any = None
+    segmentation: Any = None
     preset: Any = None
     data: Any = None
     body: Any = None
