@@ -13,6 +13,7 @@ from ljn.reading import READ_ERRORS, brief, read_arrays, read_json, read_yaml, r
 
 DEPTH_SUFFIXES = (".png", ".npy", ".npz")
 RGB_SUFFIXES = (".png", ".jpg", ".jpeg")
+_DEEP = ("I", "I;16", "I;16B", "F")  # those of more than 8 bits
 _GREY = ("1", "L", "I", "I;16", "I;16B", "F")  # Pillow's modes of one channel
 _CAMERA_KEYS = ("fx", "fy", "cx", "cy", "width", "height")
 
@@ -77,9 +78,12 @@ def read_rgb(path: str | Path) -> np.ndarray:
     path = _existing(path, "rgb")
     if path.suffix.lower() not in RGB_SUFFIXES:
         raise ValueError(f"rgb: expected one of {', '.join(RGB_SUFFIXES)}, got '{path}'")
-    image = _read_image(path, "rgb", ())
-    if image.dtype != np.uint8:
-        raise ValueError(f"rgb: expected 8 bits a channel, '{path}' has {image.dtype}: the depth image?")
+    image = _read_image(path, "rgb", _DEEP)
+    if image.dtype != np.uint8 or image.ndim != 3:
+        raise ValueError(
+            f"rgb: expected 8 bits a channel, red, green and blue; '{path}' has {image.dtype} and shape {image.shape}: "
+            "the depth image?"
+        )
     return image
 
 
