@@ -273,7 +273,7 @@ def test_a_keypoint_detector_of_colours_needs_the_colour_image(
     predict(smoke_config(tmp_path, "task=predict", *given, f"task.rgb={tmp_path / 'colours.jpg'}"))
     (summary,) = (tmp_path / "predictions").glob("*/predictions.json")
     assert json.loads(summary.read_text())["frames"]["depth"]["keypoints_found_in"] == "rgb"
-    with pytest.raises(
-        ValueError, match=r"rgb: expected 8 bits a channel, .* has .*: the depth image\?|rgb: expected"
-    ):
-        predict(smoke_config(tmp_path, "task=predict", *given, f"task.rgb={tmp_path / 'depth.npy'}"))
+    Image.fromarray((1000 * image[0]).astype(np.uint16)).save(tmp_path / "deep.png")
+    for name, problem in (("depth.npy", "expected one of .png"), ("deep.png", "expected 8 bits a channel")):
+        with pytest.raises(ValueError, match=f"rgb: {problem}"):
+            predict(smoke_config(tmp_path, "task=predict", *given, f"task.rgb={tmp_path / name}"))
