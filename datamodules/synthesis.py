@@ -14,7 +14,7 @@ from datamodules.noise import JOINT_NOISES, add_depth_noise, add_joint_noise, ad
 from datamodules.placement import HEADINGS, check_margin, draw_heading, place
 from datamodules.scenes import KeptScenes, Scene, mirrored
 from datamodules.sensor import Sensor
-from datamodules.sources import PoseRecords
+from datamodules.sources import ImageSource, PoseRecords
 from ljn.body import GENDERS, SMPL, BodyModel, SparseSMPL
 from ljn.body.skeleton import NUM_JOINTS
 from ljn.cloud.observation import ObservationRecipe, observe, stack_observations
@@ -344,6 +344,25 @@ class DepthSynthesizer:
         if not is_left.any():
             return None, None
         return fill_missing(np.where(is_left[:, None], keypoints, np.nan)), is_left.astype(np.float32)
+
+
+class RecordedSynthesizer(DepthSynthesizer):
+    """Samples of records that have depth images of their own: these are seen as they are, without anything added.
+
+    Args:
+        source: Where the images come from.
+        others: As `DepthSynthesizer`; of the settings, those of keypoints and joints count.
+    """
+
+    def __init__(self, source: ImageSource, *others: Any) -> None:
+        super().__init__(*others)
+        self.source = source
+
+    def _render(self, keys: Sequence[SampleKey], with_depth: bool) -> Scene:
+        return self.source.scene(self.records, [index for _, index in keys], with_depth)
+
+    def _with_noise(self, keys: Sequence[SampleKey], scene: Scene) -> Scene:
+        return scene
 
 
 def varied_camera(camera: Camera, focal_factor: float, pixel_factor: float) -> Camera:

@@ -3,7 +3,7 @@
 import hashlib
 import logging
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -26,12 +26,19 @@ from datamodules.batches import (
 from datamodules.cache import cached_records, cached_samples
 from datamodules.placement import check_margin
 from datamodules.sensor import Sensor
-from datamodules.sources import PoseRecords, PoseSource
-from datamodules.synthesis import SAMPLES_VERSION, DepthSynthesizer, SampleKey, SynthesisSettings, concatenate
+from datamodules.sources import Examinable, ImageSource, PoseRecords, PoseSource
+from datamodules.synthesis import (
+    SAMPLES_VERSION,
+    DepthSynthesizer,
+    RecordedSynthesizer,
+    SampleKey,
+    SynthesisSettings,
+    concatenate,
+)
 from ljn.body import BodyModel, load_body_models
 from ljn.cloud.normals import get_normal_estimator
 from ljn.cloud.observation import ObservationRecipe
-from ljn.data import SPLITS, Batch, DataModule
+from ljn.data import SPLITS, Batch, DataModule, Finding
 from ljn.geometry.camera import Camera
 from ljn.geometry.rotations import rotvec_to_rotmat
 from ljn.modules.joint_detector import JointDetector
@@ -50,7 +57,7 @@ class SyntheticDepthDataModule(DataModule):
     it was resumed. Validation and test sets are fixed: made once (from float64 meshes) and kept in `cache_dir`.
 
     Args:
-        source: Where poses come from.
+        source: Where poses come from, and of an `ImageSource` depth images, too.
         camera: The depth camera.
         synthesis: How a pose becomes a sample.
         observation: How its depth image is observed.
@@ -202,6 +209,11 @@ class SyntheticDepthDataModule(DataModule):
             "seeds": {"seed": self.seed, "pool_seed": self.pool_seed, "eval_seed": self.eval_seed},
         }
 
+    def examine(self, number: int | None) -> Iterator[Finding]:
+        """See `DataModule`: what the source finds."""
+        if isinstance(self.source, Examinable):
+            yield from self.source.examine(self.bodies, number)
+
     def prepare_data(self) -> None:
         """Check every file and package that will be needed, before anything expensive starts."""
         self.source.check()
@@ -267,7 +279,7 @@ class SyntheticDepthDataModule(DataModule):
 
     def _synthesizer(self, split: str) -> DepthSynthesizer:
         is_train = split == "train"
-        return DepthSynthesizer(
+        arguments = (
             self._records_of(split),
             self.bodies,
             self.camera,
@@ -279,6 +291,9 @@ class SyntheticDepthDataModule(DataModule):
             -(-BLOCK // max(1, self.num_workers)) if is_train and self.reuse > 1 else 0,
             self.sensor,
         )
+        if isinstance(self.source, ImageSource):
+            return RecordedSynthesizer(self.source, *arguments)
+        return DepthSynthesizer(*arguments)
 
     def train_dataloader(self) -> DataLoader:
         """Samples rendered as they are needed; the last, incomplete batch is dropped."""

@@ -12,12 +12,13 @@ from ljn.runs.keys import CONFIG_GROUPS, Key, key_of, kind_of
 
 # A stored configuration is resolved: what was made of the body's group has to follow by hand.
 _OF_BODY = {
-    "body.path": ("data.body_path", "module.body_path"),
+    "body.path": ("data.body_path", "data.source.body_path", "module.body_path"),
     "body.genders": ("data.source.genders", "module.genders"),
     "body.predicted": ("module.predicted",),
 }
 _MISSING = object()
-_SENSOR = "data/sensor="
+_WHOLE = {"data/sensor=": ("data.sensor",), "data/source=": ("data.source", "data.synthesis.heading")}
+"""Groups that an evaluation may choose as a whole, and the keys that they set."""
 
 
 def typed_overrides() -> list[str]:
@@ -29,7 +30,8 @@ def with_checkpoint_config(cfg: DictConfig, checkpoint: Checkpoint, overrides: l
     """The call's configuration with the checkpoint's model, data and trainer, and the overrides on top.
 
     Of the checkpoint's groups, the keys that `ljn.runs.keys` gives to the machine or the call have this call's values;
-    and with `data/sensor=NAME` the data has that chain of steps, its cameras as they are.
+    with `data/sensor=NAME` the data has that chain of steps, its cameras as they are; and with `data/source=NAME` its
+    poses, or images, are those of another source.
 
     Raises:
         ValueError: An override is about something that the checkpoint decides.
@@ -38,10 +40,12 @@ def with_checkpoint_config(cfg: DictConfig, checkpoint: Checkpoint, overrides: l
     plain |= {name: _with_call(checkpoint.config[name], plain[name], name) for name in CONFIG_GROUPS}
     merged = OmegaConf.create(plain)
     OmegaConf.set_struct(merged, True)
-    single = [line for line in overrides if not line.startswith(_SENSOR)]
-    if len(single) < len(overrides):
-        OmegaConf.update(merged, "data.sensor", cfg.data.sensor, merge=False, force_add=True)
-    apply_overrides(merged, single)
+    for start, keys in _WHOLE.items():
+        if any(line.startswith(start) for line in overrides):
+            for key in keys:
+                chosen = OmegaConf.select(cfg, key)
+                OmegaConf.update(merged, key, chosen, merge=False, force_add=True)
+    apply_overrides(merged, [line for line in overrides if not line.startswith(tuple(_WHOLE))])
     return merged
 
 

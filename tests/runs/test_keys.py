@@ -1,3 +1,4 @@
+import re
 import shutil
 from collections.abc import Mapping
 from dataclasses import fields
@@ -30,7 +31,8 @@ def keys_of(conf):
         group = ".".join(path.parent.relative_to(conf).parts)
         content = OmegaConf.to_container(OmegaConf.load(path), resolve=False)
         content.pop("defaults", None)
-        package = "" if "@package _global_" in path.read_text() else group
+        header = re.search(r"^# @package (\S+)$", path.read_text(), re.MULTILINE)
+        package = header[1].replace("_global_", "") if header else group
         keys |= {group, *(key for key, _ in leaves(content, package))}
     return keys - {""}
 

@@ -67,7 +67,7 @@ def test_overrides_change_data_and_nothing_that_the_checkpoint_decides(trained, 
     assert merged.data.observation.num_points == 128
     for override in (
         *("model.edm=false", "preset=thesis", "experiment=detector/basic", "data=synthetic", "seed=3"),
-        *("data/source=embedded", "~data.synthesis.distance_m", "+data.more=1", "sweep=demo"),
+        *("data/camera=kinect_v2", "~data.synthesis.distance_m", "+data.more=1", "sweep=demo"),
     ):
         with pytest.raises(ValueError, match="come from the checkpoint"):
             with_checkpoint_config(cfg, checkpoint, [override])
