@@ -351,11 +351,13 @@ class RecordedSynthesizer(DepthSynthesizer):
 
     Args:
         source: Where the images come from.
+        records: Its records.
         others: As `DepthSynthesizer`; of the settings, those of keypoints and joints count.
     """
 
-    def __init__(self, source: ImageSource, *others: Any) -> None:
-        super().__init__(*others)
+    def __init__(self, source: ImageSource, records: PoseRecords, *others: Any) -> None:
+        super().__init__(records, *others)
+        self.records = records  # with the headings that the images show
         self.source = source
 
     def _render(self, keys: Sequence[SampleKey], with_depth: bool) -> Scene:

@@ -128,7 +128,7 @@ class SyntheticDepthDataModule(DataModule):
         self.seed = seed
         self.pool_seed = pool_seed
         self.eval_seed = eval_seed
-        self.cache_dir = Path(cache_dir)
+        self.cache_dir = source.cache_dir = Path(cache_dir)
         self.body_path = body_path
         self.redraw_each_epoch = redraw_each_epoch
         self.num_workers = num_workers

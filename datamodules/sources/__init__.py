@@ -4,6 +4,7 @@ import hashlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -86,7 +87,13 @@ class PoseRecords:
 
 
 class PoseSource(Protocol):
-    """What a source of poses offers."""
+    """What a source of poses offers.
+
+    Attributes:
+        cache_dir: Where it may keep what it makes of its files; None for nowhere. A data module sets it to its own.
+    """
+
+    cache_dir: Path | None
 
     @property
     def name(self) -> str:

@@ -93,15 +93,6 @@ KEYS: dict[str, Key] = {
     **_rows("data.observation", _DATA, "_target_ _convert_ num_points normals crop_px"),
     **_rows("data", Key.THROUGH | Key.CHANGEABLE | Key.ONE_STAGE, "detector_ckpt"),
     **_rows("data", Key.THROUGH | Key.CHANGEABLE, "source body_path"),
-    **_rows(
-        "data.source", Key.THROUGH | Key.CHANGEABLE, "_target_ _convert_ path split_path genders body_path"
-    ),
-    **_rows(
-        "data.source", Key.THROUGH | Key.CHANGEABLE, "shares families blend_share apart_share jitter_deg"
-    ),
-    **_rows("data.source", Key.THROUGH | Key.CHANGEABLE, "max_penetration_m max_beta"),
-    **_rows("data.source", Key.THROUGH | Key.CHANGEABLE, "run min_frames samples_per_clip skip radial"),
-    **_rows("data.source", Key.MACHINE | Key.CHANGEABLE, "cache_dir"),
     **_rows("data", Key.MACHINE | Key.CHANGEABLE, "cache_dir num_workers prefetch_batches"),
     "trainer": _DATA,
     **_rows("trainer", _DATA, "_target_ _convert_ max_epochs precision gradient_clip_val deterministic"),

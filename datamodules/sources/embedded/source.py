@@ -48,6 +48,7 @@ class EmbeddedSource:
 
     name = "embedded"
     version = POSES_VERSION
+    cache_dir: Path | None = None
     licence = (
         "Motion clips of DeepMimic (from pybullet, zlib licence) and the CMU Graphics Lab Motion Capture "
         "Database (free for research and commercial use); see NOTICE"

@@ -69,7 +69,7 @@ class ClipBodies:
 
 
 def lengthening() -> np.ndarray:
-    """How many times as long as the depth along the optical axis a pixel's ray is, `(240, 320)`: sqrt(1 + x^2 + y^2)."""
+    """By what factor a pixel's ray is longer than the depth along the axis, `(240, 320)`: sqrt(1 + x^2 + y^2)."""
     u = (np.arange(CAMERA.width) - CAMERA.cx) / CAMERA.fx
     v = (np.arange(CAMERA.height) - CAMERA.cy) / CAMERA.fy
     return np.sqrt(1 + u**2 + v[:, None] ** 2)

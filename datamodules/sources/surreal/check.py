@@ -94,7 +94,8 @@ def _of_camera(error_px: float) -> Finding:
         return Finding("camera: 3D joints fall on the 2D joints, 0 px beyond rounding: all is well", {})
     return Finding(
         f"camera: joints3D fall {error_px:.2f} px beyond rounding from joints2D, expected 0: joints3D, joints2D or "
-        "camLoc are not SURREAL's own (turned back, shifted, of another image size?); take the files as they were downloaded",
+        "camLoc are not SURREAL's own (turned back, shifted, of another image size?); take the files as they "
+        "were downloaded",
         {},
         is_wrong=True,
     )

@@ -154,7 +154,7 @@ class SurrealDepthSource(SurrealSource):
         ]
 
     def _images(self, name: str, frames: Sequence[int]) -> list[np.ndarray]:
-        """Depth `(240, 320)` float32, metres, of the body in some frames of a clip, as stored but turned back; else 0."""
+        """Depth `(240, 320)` float32, metres, of the body in frames of a clip, as stored but turned back; else 0."""
         depths, parts = (
             read_images(self.tree / f"{name}{kind}", key, frames)
             for kind, key in ((DEPTH, "depth"), (SEGMENTATION, "segm"))

@@ -95,14 +95,17 @@ def find_tree(path: Path | None, run: str) -> Path:
     raise FileNotFoundError(f"data.source.path: no {expected} in {path}; give the folder that has cmu in it")
 
 
-def read_index(tree: Path, run: str, cache_dir: Path) -> list[ClipEntry]:
-    """The clips of a tree, ordered by name, those that cannot be read too.
+def read_index(tree: Path, run: str, cache_dir: Path | None) -> list[ClipEntry]:
+    """The clips of a tree, ordered by name, those that cannot be read too; read anew where there is no cache.
 
     Raises:
         ValueError: There is no clip, or none that can be read.
     """
-    place = hashlib.sha256(f"{_VERSION} {tree.resolve()} {run}".encode()).hexdigest()[:16]
-    path = cache_dir / f"surreal-{place}.jsonl"
+    path = None
+    if cache_dir is not None:
+        place = hashlib.sha256(f"{_VERSION} {tree.resolve()} {run}".encode()).hexdigest()[:16]
+        path = cache_dir / f"surreal-{place}.jsonl"
+        path.parent.mkdir(parents=True, exist_ok=True)
     known = dict(_lines(path))
     files = [
         (f"{split}/{run}/{name}", size, time)
@@ -111,20 +114,18 @@ def read_index(tree: Path, run: str, cache_dir: Path) -> list[ClipEntry]:
     ]
     if not files:
         raise ValueError(f"data.source.path: no file *{INFO} in {tree}/*/{run}; is the download complete?")
-    missing = [file for file in files if file not in known]
-    if missing:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with path.open("ab", buffering=0) as log:
+    if missing := [file for file in files if file not in known]:
+        with open(path or os.devnull, "ab", buffering=0) as log:
             log.write(b"\n")  # ends a line that was cut off
             for file in tqdm(missing, desc=f"index of {tree.name}", unit="clip", disable=None, leave=False):
                 known[file] = _entry(tree, file[0])
                 log.write(f"{json.dumps([*file, *known[file][1:]])}\n".encode())
     entries = [known[file] for file in files]
-    _report(entries, path)
+    _report(entries, "the index" if path is None else str(path))
     return entries
 
 
-def _report(entries: list[ClipEntry], path: Path) -> None:
+def _report(entries: list[ClipEntry], place: str) -> None:
     damaged = [entry for entry in entries if entry.problem]
     for entry in damaged[:_NUM_NAMED]:
         _LOG.warning("left out: %s", entry.problem)
@@ -137,8 +138,8 @@ def _report(entries: list[ClipEntry], path: Path) -> None:
     if damaged or bad:
         number = sum(len(entry.bad_frames) for entry in bad)
         _LOG.warning(
-            "SURREAL: %d of %d files, and %d frames of others, are left out; all stand in %s",
-            len(damaged), len(entries), number, path,
+            "SURREAL: %d of %d files, and %d frames of others, are left out; all are named in %s",
+            len(damaged), len(entries), number, place,
         )  # fmt: skip
     if len(damaged) == len(entries):
         raise ValueError(
@@ -174,9 +175,9 @@ def _content(clip: Clip) -> str:
     return digest.hexdigest()[:16]
 
 
-def _lines(path: Path) -> Iterator[tuple[tuple[str, int, int], ClipEntry]]:
+def _lines(path: Path | None) -> Iterator[tuple[tuple[str, int, int], ClipEntry]]:
     """The lines of an index, each file's last one last; those that are cut off or of another form are passed over."""
-    if not path.is_file():
+    if path is None or not path.is_file():
         return
     for line in path.read_bytes().split(b"\n"):
         try:

@@ -38,7 +38,6 @@ class SurrealSource:
 
     Args:
         path: The folder that has `cmu` in it, or that one itself.
-        cache_dir: Where the index of the tree is kept.
         run: Of the runs with different overlaps of clips, which one.
         min_frames: Clips of fewer frames have no part.
         samples_per_clip: Frames of a clip that has a part, at least.
@@ -49,6 +48,7 @@ class SurrealSource:
 
     name = "surreal"
     version = 1
+    cache_dir: Path | None = None
     licence = (
         "SURREAL (Varol et al., CVPR 2017), the user's own copy, licensed for non-commercial research: "
         "https://www.di.ens.fr/willow/research/surreal/data"
@@ -56,8 +56,7 @@ class SurrealSource:
 
     def __init__(
         self,
-        path: str | Path | None,
-        cache_dir: str | Path,
+        path: str | Path | None = None,
         run: str = "run0",
         min_frames: int = 6,
         samples_per_clip: int = 3,
@@ -75,7 +74,6 @@ class SurrealSource:
                 f"got {list(genders)}"
             )
         self.path = Path(path) if path is not None else None
-        self.cache_dir = Path(cache_dir)
         self.run = run
         self.min_frames = min_frames
         self.samples_per_clip = samples_per_clip

@@ -2,8 +2,8 @@
 
 A body in a file (`pose`, z up) was turned by `zrot` about the vertical and then by 90 degrees about x into a world
 whose y points down. The camera looks along that world's negative x, and its axes are left-handed (det R = -1): every
-image shows its scene in a mirror. Turned back about its middle column, an image is what an ordinary camera would have seen, and the
-body in front of it has, in our body world, the file's pose turned by `zrot` about the vertical, and nothing else.
+image shows its scene in a mirror. Turned back about its middle column, an image is what an ordinary camera would
+have seen, and the body in front of it has, in our body world, the file's pose turned by `zrot` about the vertical.
 """
 
 import math

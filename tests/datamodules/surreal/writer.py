@@ -65,7 +65,8 @@ def make_clip(seed=0, num_frames=4, gender=None, distance=6.0):
     pixels = np.round(homogeneous[..., :2] / homogeneous[..., 2:])
     fields = {
         "bg": "some/where.jpg", "camDist": np.float32(distance), "camLoc": place[:, None], "clipNo": 1,
-        "cloth": "a.jpg", "gender": np.full((num_frames, 1), gender, np.uint8), "light": np.zeros((9, 1)), "pose": pose.T,
+        "cloth": "a.jpg", "gender": np.full((num_frames, 1), gender, np.uint8), "light": np.zeros((9, 1)),
+        "pose": pose.T,
         "joints2D": pixels.astype(np.float32).transpose(2, 1, 0), "joints3D": joints.transpose(2, 1, 0),
         "sequence": "01_01", "shape": betas.T, "source": "cmu", "stride": 50, "zrot": zrot[:, None],
     }  # fmt: skip
