@@ -85,7 +85,7 @@ class SurrealDepthSource(SurrealSource):
         return ClipBodies(self._models)
 
     def __getstate__(self) -> dict[str, Any]:
-        return {name: value for name, value in self.__dict__.items() if name != "_bodies"}
+        return {name: value for name, value in self.__dict__.items() if name not in ("_bodies", "_sample")}
 
     def _is_usable(self, entry: ClipEntry) -> bool:
         return super()._is_usable(entry) and all(
