@@ -174,5 +174,5 @@ def test_frames_whose_images_are_damaged_or_empty_are_left_out(tmp_path, caplog)
     assert "01_01_c0002_depth.mat: " in caplog.text
     assert "6 of 9 samples of test come twice" in caplog.text
     depth.with_name("01_01_c0001_depth.mat").write_bytes(b"")
-    with pytest.raises(ValueError, match="no depth image in .* can be read, of 3 clips"):
+    with pytest.raises(ValueError, match=r"no depth image in .* can be read, of 3 clips"):
         SurrealDepthSource(tmp_path).check()

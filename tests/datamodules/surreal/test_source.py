@@ -195,10 +195,10 @@ def test_a_missing_tree_is_named_with_what_was_expected(tmp_path, tree):
     with pytest.raises(FileNotFoundError, match=r"run: expected run3 .*which have run0"):
         SurrealSource(tree, run="run3").check()
     (tmp_path / "cmu" / "test" / "run0").mkdir(parents=True)
-    with pytest.raises(ValueError, match="no file .*is the download complete"):
+    with pytest.raises(ValueError, match=r"no file .*is the download complete"):
         SurrealSource(tmp_path).check()
     write_plain(tmp_path, "test", "01_01", num_frames=5)
-    with pytest.raises(ValueError, match="of 1 clips in .* none has 6 frames or more"):
+    with pytest.raises(ValueError, match=r"of 1 clips in .* none has 6 frames or more"):
         SurrealSource(tmp_path).check()
     write_plain(tmp_path, "test", "01_01", 2)
     with pytest.raises(ValueError, match="no usable clip for 'train'"):
@@ -206,7 +206,7 @@ def test_a_missing_tree_is_named_with_what_was_expected(tmp_path, tree):
     assert len(SurrealSource(tmp_path).records("val", 3, 0)) == 3, "of test, where there is no val"
     for number in (1, 2):
         write_plain(tmp_path, "test", "01_01", number, gender=4)
-    with pytest.raises(ValueError, match="none of 2 files can be read; the first: .*gender: expected 0"):
+    with pytest.raises(ValueError, match=r"none of 2 files can be read; the first: .*gender: expected 0"):
         SurrealSource(tmp_path).check()
 
 
