@@ -86,10 +86,11 @@ def read_filmed_clip(path: Path) -> FilmedClip:
     bodies = _bodies(path, arrays)
     number = len(bodies["pose"])
     zrot = _one_a_frame(path, "zrot", arrays["zrot"], number).astype(np.float64)
-    pixels, joints = (
-        _same_number(path, name, _by_frame(path, name, arrays[name]), number).astype(np.float64)
-        for name in ("joints2D", "joints3D")
-    )
+    with np.errstate(invalid="ignore"):  # numbers that are none, of damaged files
+        pixels, joints = (
+            _same_number(path, name, _by_frame(path, name, arrays[name]), number).astype(np.float64)
+            for name in ("joints2D", "joints3D")
+        )
     place = arrays["camLoc"].astype(np.float64).reshape(-1)
     if place.shape != (3,) or not np.isfinite(place).all():
         raise ValueError(f"{path}: camLoc: expected three finite numbers, got {shown(place.tolist())}")

@@ -96,7 +96,7 @@ def find_tree(path: Path | None, run: str) -> Path:
 
 
 def read_index(tree: Path, run: str, cache_dir: Path | None) -> list[ClipEntry]:
-    """The clips of a tree, ordered by name, those that cannot be read too; read anew where there is no cache.
+    """The clips of a tree, split by split and by name, those that cannot be read too; read anew without a cache.
 
     Raises:
         ValueError: There is no clip, or none that can be read.
