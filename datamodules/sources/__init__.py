@@ -134,8 +134,8 @@ class PoseSource(Protocol):
 
 
 @runtime_checkable
-class ImageSource(PoseSource, Protocol):
-    """A source whose records have depth images of their own, which are taken in place of rendered ones."""
+class ImageSource(Protocol):
+    """A `PoseSource` whose records have depth images of their own, which are taken in place of rendered ones."""
 
     def scene(self, records: PoseRecords, rows: Sequence[int], with_depth: bool) -> Scene:
         """The bodies of some records before the camera that saw them; without `with_depth` images are `(0, 0)`."""
@@ -144,7 +144,7 @@ class ImageSource(PoseSource, Protocol):
 
 @runtime_checkable
 class Examinable(Protocol):
-    """A source that can hold what its files say against itself."""
+    """A `PoseSource` that can hold what its files say against itself."""
 
     def examine(self, bodies: Sequence[BodyModel], num_clips: int | None) -> Iterator[Finding]:
         """What is found in so many clips from all over its files, or in all of them; with these bodies."""

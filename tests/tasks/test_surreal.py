@@ -16,13 +16,22 @@ from tests.datamodules.surreal.writer import write_clip
 
 @pytest.fixture(scope="module")
 def tree(tmp_path_factory):
-    """Twelve clips: of two subjects of training, and of one of test."""
+    """Two clips, of training and of test."""
     root = tmp_path_factory.mktemp("surreal")
+    for split, sequence in (("train", "01_01"), ("test", "03_01")):
+        write_clip(root, split, sequence, num_frames=6)
+    return root
+
+
+@pytest.fixture(scope="module")
+def larger_tree(tmp_path_factory):
+    """Twelve clips: of two subjects of training, and, with images, of one of test."""
+    root = tmp_path_factory.mktemp("larger_surreal")
     for number in range(1, 13):
-        split, sequence = ("train", f"0{1 + number % 2}_01") if number < 7 else ("test", "03_01")
-        write_clip(
-            root, split, sequence, number, images=split == "test", seed=number, num_frames=6, distance=5.0
-        )
+        is_test = number > 6
+        sequence = "03_01" if is_test else f"0{1 + number % 2}_01"
+        split = "test" if is_test else "train"
+        write_clip(root, split, sequence, number, images=is_test, seed=number, num_frames=6, distance=5.0)
     return root
 
 
@@ -38,7 +47,7 @@ def test_the_check_prints_a_line_for_each_clip_and_what_they_say_together(
     assert metrics["check/body_mm"] < 0.01
     lines = capsys.readouterr().out.splitlines()
     assert [line.split(":")[0] for line in lines] == [
-        "train/run0/01_01/01_01_c0002", "test/run0/03_01/03_01_c0012", "2 clips, 0 of them damaged", "bodies", "camera",
+        "train/run0/01_01/01_01_c0001", "test/run0/03_01/03_01_c0001", "2 clips, 0 of them damaged", "bodies", "camera",
     ]  # fmt: skip
     with pytest.raises(ValueError, match=r"task\.num_clips: expected 1 or more, or null for all, got 0"):
         check(smoke_config(tmp_path, "task=check", *chosen(tree), "task.num_clips=0"))
@@ -82,12 +91,17 @@ def test_an_evaluation_may_choose_the_source_and_has_the_checkpoints_bodies(smok
 
 
 @pytest.mark.slow
-def test_weights_are_evaluated_on_surreals_own_images(smoke_config, tmp_path, tree):
+def test_weights_are_evaluated_on_surreals_own_images(smoke_config, tmp_path, larger_tree):
     path = find_package("small", "weights")
     errors = {}
     for stage in ("detector", "mesh"):
-        call = ("task=evaluate", "weights=small", f"task.stage={stage}", *chosen(tree, "surreal_depth"))
-        typed = [*chosen(tree, "surreal_depth"), "data.num_test=16", "data.num_workers=0"]
+        call = (
+            "task=evaluate",
+            "weights=small",
+            f"task.stage={stage}",
+            *chosen(larger_tree, "surreal_depth"),
+        )
+        typed = [*chosen(larger_tree, "surreal_depth"), "data.num_test=16", "data.num_workers=0"]
         errors |= {stage: evaluate_checkpoint(smoke_config(tmp_path, *call), path, typed, stage=stage)}
     # Wrong sides or a wrong camera would cost some 200 mm.
     assert errors["detector"]["test/mpjpe"] < 120
@@ -98,13 +112,13 @@ def test_weights_are_evaluated_on_surreals_own_images(smoke_config, tmp_path, tr
 
 
 @pytest.mark.slow
-def test_a_table_is_trained_on_surreal(run_py, tmp_path, tree):
+def test_a_table_is_trained_on_surreal(run_py, tmp_path, larger_tree):
     done = run_py(
         *(
             "sweep=table_3_2",
             "experiment=detector/basic,detector/simple_baseline",
             "preset=smoke",
-            *chosen(tree),
+            *chosen(larger_tree),
         ),
         *(f"paths.output_dir={tmp_path}", "logger=csv", "data.num_workers=0"),
     )

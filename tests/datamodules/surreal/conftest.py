@@ -39,10 +39,10 @@ def write_plain(root, split, sequence, number=1, num_frames=8, run="run0", **cha
 
 @pytest.fixture(scope="session")
 def filmed_tree(tmp_path_factory):
-    """A tree with images, radial, of four clips of training, test and validation."""
+    """A tree of four clips of training, test and validation; of test with images, radial."""
     root = tmp_path_factory.mktemp("filmed")
     for number, (split, sequence) in enumerate(
         [("train", "01_01"), ("test", "02_01"), ("test", "ung_03_02"), ("val", "02_01")]
     ):
-        write_clip(root, split, sequence, images=True, seed=number, num_frames=6, distance=5.0)
+        write_clip(root, split, sequence, images=split == "test", seed=number, num_frames=6, distance=5.0)
     return root

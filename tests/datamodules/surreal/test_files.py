@@ -51,6 +51,13 @@ def test_points_fall_where_surreals_own_matrices_project_them():
     np.testing.assert_allclose(found, expected[:, :2] / expected[:, 2:], atol=1e-9)
 
 
+def test_a_joint_of_a_real_file_falls_on_its_pixel():
+    """From the comments of `main.m` in SURREAL's repository, of 01_01_c0001."""
+    place = np.array([6.7456, -0.9839, -1.9293])
+    pixel = to_pixels(to_mirrored_camera(np.array([-0.8645, -1.0915, -1.0260]), place))
+    assert np.round(pixel).tolist() == [89, 112]
+
+
 def without(name):
     return lambda fields: {key: value for key, value in fields.items() if key != name}
 

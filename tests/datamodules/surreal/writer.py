@@ -57,18 +57,20 @@ def make_clip(seed=0, num_frames=4, gender=None, distance=6.0):
     transl = np.array([rng.uniform(-0.3, 0.3), 0.0, rng.uniform(-1, 1)])
     vertices, joints = vertices.numpy() + transl, joints.numpy() + transl
     joints = joints.astype(np.float32)
-    place = np.array([distance + rng.uniform(-0.5, 0.5), rng.uniform(-0.2, 0.4), 0.0])
+    place = np.array([distance + rng.uniform(-0.5, 0.5), rng.uniform(-0.2, 0.4), 0.0]).astype(np.float32)
+    place = place.astype(float)  # as it is in the file
 
     homogeneous = (
         np.concatenate([joints.astype(float), np.ones((num_frames, 24, 1))], -1) @ projection(place).T
     )
     pixels = np.round(homogeneous[..., :2] / homogeneous[..., 2:])
+    names = np.full(num_frames, "some/where.jpg", dtype=object)
     fields = {
-        "bg": "some/where.jpg", "camDist": np.float32(distance), "camLoc": place[:, None], "clipNo": 1,
-        "cloth": "a.jpg", "gender": np.full((num_frames, 1), gender, np.uint8), "light": np.zeros((9, 1)),
-        "pose": pose.T,
+        "bg": names, "camDist": np.float32(distance), "camLoc": place[:, None].astype(np.float32), "clipNo": 1.0,
+        "cloth": names, "gender": np.full((num_frames, 1), gender, np.uint8),
         "joints2D": pixels.astype(np.float32).transpose(2, 1, 0), "joints3D": joints.transpose(2, 1, 0),
-        "sequence": "01_01", "shape": betas.T, "source": "cmu", "stride": 50, "zrot": zrot[:, None],
+        "light": np.zeros((9, 100), np.float32), "pose": pose.T, "sequence": "01_01_c0001", "shape": betas.T,
+        "source": "cmu", "stride": np.uint8(50), "zrot": zrot[:, None],
     }  # fmt: skip
     if num_frames == 1:  # as MATLAB has it
         fields["joints2D"], fields["joints3D"] = fields["joints2D"][:, :, 0], fields["joints3D"][:, :, 0]
@@ -98,20 +100,31 @@ def write_mat(path, fields, compressed=False):
 
 
 def write_mat73(path, fields, h5py, cells=()):
-    """As MATLAB's `save -v7.3`: HDF5 after a block of text, dimensions in reverse order, letters as numbers."""
+    """As MATLAB's `save -v7.3`: HDF5 after a block of text, dimensions in reverse order, letters as numbers.
+
+    Cell arrays refer to their cells; those of `cells` have one, with the field in it.
+    """
+
+    def add(place, value):
+        is_text = isinstance(value, str)
+        array = np.array([list(value.encode())], np.uint16) if is_text else np.atleast_2d(value)
+        data = file.create_dataset(place, data=np.ascontiguousarray(array.T))
+        kinds = {"float32": "single", "float64": "double", "uint16": "char", "uint8": "uint8"}
+        data.attrs["MATLAB_class"] = np.bytes_(kinds[array.dtype.name])
+        return data
+
     path.parent.mkdir(parents=True, exist_ok=True)
     with h5py.File(path, "w", userblock_size=512) as file:
         for name, value in fields.items():
-            is_text = isinstance(value, str)
-            array = np.array([list(value.encode())], np.uint16) if is_text else np.atleast_2d(value)
-            kind = "char" if is_text else "single" if array.dtype == np.float32 else "double"
-            place = f"#refs#/{name}" if name in cells else name
-            data = file.create_dataset(place, data=np.ascontiguousarray(array.T))
-            data.attrs["MATLAB_class"] = np.bytes_(kind)
-            if name in cells:
-                cell = file.create_dataset(name, (1, 1), h5py.ref_dtype)
-                cell[0, 0] = data.ref
-                cell.attrs["MATLAB_class"] = np.bytes_("cell")
+            is_cells = name in cells or (isinstance(value, np.ndarray) and value.dtype == object)
+            if not is_cells:
+                add(name, value)
+                continue
+            content = [value] if name in cells else value
+            cell = file.create_dataset(name, (len(content), 1), h5py.ref_dtype)
+            for number, each in enumerate(content):
+                cell[number, 0] = add(f"#refs#/{name}{number}", each).ref
+            cell.attrs["MATLAB_class"] = np.bytes_("cell")
     with path.open("r+b") as file:
         file.write(b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(124, b" ") + b"\x00\x02IM")
 
