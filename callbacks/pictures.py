@@ -16,8 +16,8 @@ from torch import Tensor
 from callbacks.gathering import gather_samples, join_batches
 from ljn.body.skeleton import ROOT
 from ljn.data import Batch
-from ljn.drawing import MeshSample, Sample, clouds, draw_meshes, draw_samples
-from ljn.geometry.camera import place_at_root
+from ljn.drawing import CropSample, MeshSample, Sample, clouds, draw_crops, draw_meshes, draw_samples
+from ljn.geometry.camera import place_at_root, project, transfer
 from ljn.metrics.functional import mpjpe
 from ljn.runs import layout
 
@@ -200,3 +200,31 @@ class MeshPictures(Pictures):
             meshes.append(place_at_root(vertices, joints[:, ROOT], on_device[root]).cpu().numpy())
         rows = zip(clouds(samples), *meshes, titles)
         return draw_meshes([MeshSample(*row) for row in rows], module.body.faces.cpu().numpy(), num_columns)
+
+
+class KeypointPictures(Pictures):
+    """Crops with true (blue) and predicted (red) 2D skeletons; see `Pictures`."""
+
+    inputs = ("rgb", "crop")
+
+    def keep(self, outputs: dict[str, Tensor], batch: Batch, module: Any) -> dict[str, Tensor]:
+        """See `Pictures.keep`."""
+        crop_camera = module.observation(batch)[1]
+        return {
+            "error": outputs["crop_error_px"],
+            "pred_keypoints": transfer(outputs["pred_keypoints"], batch["camera"], crop_camera),
+            "keypoints": project(batch["joints"], crop_camera),
+        }
+
+    def unit(self, module: Any) -> str:
+        """See `Pictures.unit`."""
+        return "px"
+
+    def draw(
+        self, samples: dict[str, Tensor], titles: Sequence[str], num_columns: int, module: Any
+    ) -> "Figure":
+        """See `Pictures.draw`."""
+        images = samples["rgb"].permute(0, 2, 3, 1) if "rgb" in samples else samples["crop"]
+        keypoints, pred_keypoints = samples["keypoints"].numpy(), samples["pred_keypoints"].numpy()
+        rows = zip(images.numpy(), keypoints, pred_keypoints, titles)
+        return draw_crops([CropSample(*row) for row in rows], num_columns)

@@ -11,24 +11,20 @@ import torch
 from torch import Tensor
 
 from datamodules.noise import JOINT_NOISES, add_depth_noise, add_joint_noise, add_keypoint_noise
-from datamodules.placement import HEADINGS, check_margin, draw_heading, place
+from datamodules.placement import HEADINGS
+from datamodules.posing import BodySynthesizer, SampleKey
 from datamodules.scenes import KeptScenes, Scene, mirrored
 from datamodules.sensor import Sensor
 from datamodules.sources import ImageSource, PoseRecords
-from ljn.body import GENDERS, SMPL, BodyModel, SparseSMPL
+from ljn.body import BodyModel
 from ljn.body.skeleton import NUM_JOINTS
 from ljn.cloud.observation import ObservationRecipe, observe, stack_observations
 from ljn.data import Batch
 from ljn.geometry.camera import Camera, project
-from ljn.geometry.rotations import body_to_camera, rotation_about, rotmat_to_rotvec, rotvec_to_rotmat
 from ljn.pipeline.filling import fill_missing
 from ljn.render import RENDERERS, Renderer, get_renderer
 
-# Each purpose has a generator of its own: changing one (the number of points, a sigma) leaves the others' draws.
-_PLACEMENT, _DEPTH_NOISE, _SAMPLING, _KEYPOINTS, _JOINTS, _MISSING, _CAMERA, _PERSON, _SENSOR = range(9)
-
-SampleKey = tuple[int, ...]
-"""An epoch, a record's index and, where a render is used again, the number of that use; without it, the first, 0."""
+_DEPTH_NOISE, _SAMPLING, _KEYPOINTS, _JOINTS, _MISSING, _SENSOR = 1, 2, 3, 4, 5, 8  # see datamodules.posing
 
 SAMPLES_VERSION = 1
 """Raised with every change of the samples made of the same records: results are comparable within a version only."""
@@ -45,7 +41,8 @@ class SynthesisSettings:
     """How a pose becomes a sample.
 
     Attributes:
-        heading: `histogram`, `uniform` or `source`; see `draw_heading`.
+        heading: `histogram`, `uniform` or `source`; see `draw_heading`. All but `source` take the place of a heading
+            that was recorded.
         distance_m: Range of the depth of the body's centre, metres.
         margin_px: Clear border around the body, pixels.
         depth_noise_m: Standard deviation of the depth noise of the sensor `gaussian`, metres; others have their own.
@@ -104,19 +101,13 @@ class SynthesisSettings:
             )
         object.__setattr__(self, "missing_keypoints", tuple(map(float, shares)))
 
-    def smallest(self, camera: Camera) -> Camera:
-        """The camera with the smallest image and the narrowest view that a sample may have."""
-        return varied_camera(camera, self.focal_factors[1], self.pixel_factors[0])
-
     def densest_focal_px(self, camera: Camera) -> float:
         """The longest focal length that a sample may have, pixels."""
         return camera.fx * self.focal_factors[1] * self.pixel_factors[1]
 
 
-class DepthSynthesizer:
-    """Renders samples of a table of records; cheap to build and to send to a worker process.
-
-    The body layer and the renderer are made on first use, in the process that uses them.
+class DepthSynthesizer(BodySynthesizer):
+    """Renders samples of a table of records, seen by a depth camera.
 
     Args:
         records: The poses and shapes.
@@ -126,12 +117,14 @@ class DepthSynthesizer:
         recipe: How depth images are observed.
         takes: What of an observation is made beside keypoints and initial joints: see `ljn.cloud.observation.PARTS`.
             Where none of it comes from a depth image, none is rendered.
-        seed_key: What the random draws depend on, beside a sample's epoch and index: a seed and a split number.
-        dtype: Precision of the body; float64 makes fixed sets agree across machines.
+        seed_key: See `BodySynthesizer`.
+        dtype: See `BodySynthesizer`.
         num_kept: How many batches' renders are kept, for batches of the same bodies to come.
         sensor: What becomes of bodies and images before they are observed; None for `gaussian`, the thesis's: noise of
             `settings.depth_noise_m` on the body, and nothing else.
     """
+
+    lazy = ("_smpl", "_renderer", "_kept")
 
     def __init__(
         self,
@@ -146,29 +139,11 @@ class DepthSynthesizer:
         num_kept: int = 0,
         sensor: Sensor | None = None,
     ) -> None:
-        if settings.heading == "source" and not records.has_heading:
-            raise ValueError(
-                "heading: these poses carry no heading of their own; use 'histogram' or 'uniform'"
-            )
-        check_margin(settings.smallest(camera), settings.margin_px)
-        self.records = records
-        self.bodies = bodies
-        self.camera = camera
+        super().__init__(records, bodies, camera, settings, seed_key, dtype, sensor)
         self.settings = settings
         self.recipe = recipe
         self.takes = {*takes, "keypoints", "initial_joints"}
-        self.seed_key = seed_key
-        self.dtype = dtype
         self.num_kept = num_kept
-        self.sensor = sensor
-
-    def __getstate__(self) -> dict[str, Any]:
-        lazy = ("_smpl", "_renderer", "_kept")
-        return {name: value for name, value in self.__dict__.items() if name not in lazy}
-
-    @cached_property
-    def _smpl(self) -> SMPL:
-        return SparseSMPL(self.bodies).to(self.dtype)
 
     @cached_property
     def _renderer(self) -> Renderer:
@@ -178,18 +153,8 @@ class DepthSynthesizer:
     def _kept(self) -> KeptScenes:
         return KeptScenes(self.num_kept)
 
-    def _rng(self, key: SampleKey, purpose: int) -> np.random.Generator:
-        return np.random.default_rng(self._seed(key, purpose))
-
-    def _seed(self, key: SampleKey, purpose: int) -> list[int]:
-        epoch, index, *use = key
-        return [*self.seed_key, epoch, index, purpose, *(use if any(use) else ())]
-
     def batch(self, keys: Sequence[SampleKey]) -> Batch:
-        """The samples of `keys`.
-
-        A sample depends on its key alone; in float32 up to the rounding of products over a batch.
-        """
+        """See `BodySynthesizer`."""
         rendered, which = tuple(key[:2] for key in keys), [is_mirrored(key) for key in keys]
         scene = self._kept.get(rendered, which)
         if scene is None:
@@ -222,67 +187,14 @@ class DepthSynthesizer:
         """Whether anything that is taken comes from a depth image."""
         return bool(self._seen - {"keypoints", "confidences"})
 
-    @torch.no_grad()
     def _render(self, keys: Sequence[SampleKey], with_depth: bool) -> Scene:
-        """Pose the bodies, place them before their cameras, render them where depth is wanted."""
-        settings = self.settings
-        cameras = [self._camera_of(key) for key in keys]
-        placement = [self._rng(key, _PLACEMENT) for key in keys]
-        rows = [index for _, index in keys]
-        pose = torch.from_numpy(self.records.pose[rows]).to(self.dtype)
-        heading = torch.tensor([draw_heading(settings.heading, rng) for rng in placement], dtype=self.dtype)
-        root = rotation_about("z", heading) @ rotvec_to_rotmat(pose[:, :3])
-        betas = torch.from_numpy(self.records.betas[rows]).to(self.dtype)
-        if self.sensor is not None:
-            root, betas = self._as_seen(keys, root, betas)
-        pose = torch.cat([rotmat_to_rotvec(root), pose[:, 3:]], -1)
-
-        gender = torch.from_numpy(self.records.gender[rows])
-        vertices, joints = self._smpl(pose, betas, gender)
-        vertices, joints = body_to_camera(vertices), body_to_camera(joints)
-        transl = torch.from_numpy(
-            np.stack(
-                [
-                    place(mesh, camera, rng.random(3), settings.distance_m, settings.margin_px)
-                    for mesh, camera, rng in zip(vertices.numpy(), cameras, placement)
-                ]
-            )
-        ).to(self.dtype)
-        joints = joints + transl[:, None]
+        """The bodies before their cameras, rendered where depth is wanted."""
+        posed = self._posed(keys, is_dressed=with_depth)
         if with_depth:
-            if self.sensor is not None:  # after the bodies have their places, which clothes do not change
-                for mesh, key, row in zip(vertices.numpy(), keys, gender.tolist()):
-                    self.sensor.dress(mesh, self._body_of[row], self._seed(key, _PERSON))
-            depth = self._images(vertices + transl[:, None], cameras)
+            depth = self._images(posed.vertices, posed.cameras)
         else:
             depth = [np.zeros((0, 0), np.float32)] * len(keys)
-        return Scene(pose, betas, gender, joints, cameras, depth)
-
-    def _as_seen(self, keys: Sequence[SampleKey], root: Tensor, betas: Tensor) -> tuple[Tensor, Tensor]:
-        """The roots' rotations `(B, 3, 3)` and shapes `(B, 10)` that the sensor makes of others."""
-        assert self.sensor is not None
-        root, betas = root.clone(), betas.clone()
-        for i, key in enumerate(keys):
-            seed = self._seed(key, _PERSON)
-            turned = self.sensor.turn(seed)
-            if turned is not None:
-                root[i] = torch.from_numpy(turned).to(root) @ root[i]
-            betas[i] = torch.from_numpy(self.sensor.shape(betas[i].numpy(), seed)).to(betas)
-        return root, betas
-
-    @cached_property
-    def _body_of(self) -> dict[int, BodyModel]:
-        """The body of each gender's code."""
-        return {GENDERS[body.gender]: body for body in self.bodies}
-
-    def _camera_of(self, key: SampleKey) -> Camera:
-        """The camera of a sample."""
-        ranges = (self.settings.focal_factors, self.settings.pixel_factors)
-        if all(low == high == 1 for low, high in ranges):
-            return self.camera
-        rng = self._rng(key, _CAMERA)
-        factors = [math.exp(rng.uniform(math.log(low), math.log(high))) for low, high in ranges]
-        return varied_camera(self.camera, *factors)
+        return Scene(posed.pose, posed.betas, posed.gender, posed.joints, posed.cameras, depth)
 
     def _images(self, vertices: Tensor, cameras: Sequence[Camera]) -> list[np.ndarray]:
         """The depth images of meshes, each by its camera: all at once where that is the same."""
@@ -365,20 +277,6 @@ class RecordedSynthesizer(DepthSynthesizer):
 
     def _with_noise(self, keys: Sequence[SampleKey], scene: Scene) -> Scene:
         return scene
-
-
-def varied_camera(camera: Camera, focal_factor: float, pixel_factor: float) -> Camera:
-    """A camera with another focal length in an image of the same shape, then with another number of pixels."""
-    width, height = (max(1, round(size * pixel_factor)) for size in (camera.width, camera.height))
-    along_u, along_v = width / camera.width, height / camera.height
-    return Camera(
-        camera.fx * focal_factor * along_u,
-        camera.fy * focal_factor * along_v,
-        (camera.cx + 0.5) * along_u - 0.5,
-        (camera.cy + 0.5) * along_v - 0.5,
-        width,
-        height,
-    )
 
 
 def concatenate(batches: Iterable[Batch], num_samples: int) -> dict[str, Tensor]:

@@ -13,8 +13,8 @@ from omegaconf import DictConfig, OmegaConf
 from ljn.reading import brief, reason
 
 OWN_MODULES = (
-    "ljn.nets.", "ljn.modules.", "ljn.geometry.camera.", "ljn.cloud.observation.", "ljn.benchmark.", "datamodules.",
-    "callbacks.",
+    "ljn.nets.", "ljn.modules.", "ljn.geometry.camera.", "ljn.cloud.observation.", "ljn.cloud.rgb.",
+    "ljn.benchmark.", "datamodules.", "callbacks.",
 )  # fmt: skip
 """The modules whose classes a config may name."""
 _FOREIGN_BASES = {

@@ -13,6 +13,7 @@ from ljn.body import BodyModel
 
 if TYPE_CHECKING:
     from ljn.cloud.observation import ObservationRecipe
+    from ljn.cloud.rgb import RgbRecipe
 
 SPLITS = ("train", "val", "test")
 
@@ -24,6 +25,8 @@ class Batch(TypedDict, total=False):
         points: `(B, N, 6)`.
         crop: `(B, P, P)`.
         crop_camera: `(B, 4)`.
+        rgb: `(B, 3, h, w)` uint8, a colour crop; see `ljn.cloud.rgb`.
+        rgb_camera: `(B, 4)`: fx, fy, cx, cy of that crop, in its own pixels.
         keypoints: `(B, 24, 2)`, with noise.
         confidences: `(B, 24)`, 0 where a keypoint is missing.
         initial_joints: `(B, 24, 3)`: keypoints lifted with the depth image, or what stands in their place.
@@ -40,6 +43,8 @@ class Batch(TypedDict, total=False):
     points: Tensor
     crop: Tensor
     crop_camera: Tensor
+    rgb: Tensor
+    rgb_camera: Tensor
     keypoints: Tensor
     confidences: Tensor
     initial_joints: Tensor
@@ -82,7 +87,7 @@ class DataModule(LightningDataModule):
         return ()
 
     @property
-    def recipe(self) -> "ObservationRecipe | None":
+    def recipe(self) -> "ObservationRecipe | RgbRecipe | None":
         """How its observations are made, and what was trained with them: goes into checkpoints."""
         return None
 
@@ -98,7 +103,8 @@ class DataModule(LightningDataModule):
 
     @abstractmethod
     def examples(self, split: str, indices: Sequence[int]) -> tuple[Batch, Tensor]:
-        """Samples of a split by their numbers, and the depth images `(B, H, W)`, metres, that they were taken from.
+        """Samples of a split by their numbers, and what they were taken from: depth images `(B, H, W)`, metres, or, of
+        samples in colour, their crops `(B, 3, h, w)` uint8.
 
         Training samples are those of the first epoch.
 

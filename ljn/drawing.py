@@ -7,8 +7,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ljn.body.skeleton import BONES
-from ljn.geometry.camera import Camera, back_project
+from ljn.body.skeleton import BONES, JOINT_NAMES
+from ljn.geometry.camera import Camera, back_project, project
 from ljn.render.shading import shade_mesh
 
 if TYPE_CHECKING:
@@ -163,6 +163,41 @@ def _draw_cloud_over(axis: "Axes", points: np.ndarray, camera: Camera) -> None:
     axis.scatter(u, v, s=0.4, c="black", alpha=0.25, linewidths=0)
 
 
+class CropSample(NamedTuple):
+    """What is drawn of a keypoint detector's sample; pixels of the crop."""
+
+    image: np.ndarray  # `(H, W, 3)` uint8, or `(H, W)` depth, metres, 0 outside the body
+    keypoints: np.ndarray  # `(24, 2)`, the truth
+    pred_keypoints: np.ndarray  # `(24, 2)`
+    title: str  # text above it
+
+
+def draw_crops(samples: list[CropSample], num_columns: int) -> "Figure":
+    """A page of crops in reading order with true (blue) and predicted (red) skeletons; the left side's are thick."""
+    num_rows = -(-len(samples) // num_columns)
+    figure, axes = _page(len(samples), num_columns, 1, 2.6 * num_columns, 2.9 * num_rows + 0.3)
+    for (axis,), sample in zip(axes, samples):
+        is_depth = sample.image.ndim == 2
+        image = np.where(sample.image > 0, sample.image, np.nan) if is_depth else sample.image
+        axis.imshow(image, cmap="gray")
+        for keypoints, colour in ((sample.keypoints, _TRUE), (sample.pred_keypoints, _PREDICTED)):
+            draw_skeleton(axis, keypoints, colour)
+        height, width = sample.image.shape[:2]
+        axis.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5))
+        axis.set_title(sample.title, fontsize=9, loc="left")
+    lines = ({"color": _TRUE, "label": "true"}, {"color": _PREDICTED, "label": "predicted (left side thick)"})
+    add_legend(figure, [axes[0, 0].plot([], [], lw=2, **line)[0] for line in lines])
+    return figure
+
+
+def draw_skeleton(axis: "Axes", keypoints: np.ndarray, colour: str) -> None:
+    """The bones between keypoints `(24, 2)`, pixels; those of the left side are thicker, so that flips can be seen."""
+    for side, width in (("l_", 2.2), ("", 1.2)):
+        bones = [bone for bone in BONES if JOINT_NAMES[bone[1]].startswith("l_") == bool(side)]
+        lines = np.pad(keypoints[np.array(bones)], ((0, 0), (0, 1), (0, 0)), constant_values=np.nan)
+        axis.plot(*lines.reshape(-1, 2).T, color=colour, lw=width, solid_capstyle="round")
+
+
 def draw_examples(batch: "Batch", depth: Tensor) -> "Figure":
     """A page of B training samples, two a row: depth image with keypoints, cloud with normals, initial joints.
 
@@ -188,4 +223,17 @@ def draw_examples(batch: "Batch", depth: Tensor) -> "Figure":
         sample = Sample(points, arrays["joints"][number], arrays["initial_joints"][number], "")
         _draw_view(front, sample, horizontal=0)
         _draw_view(side, sample, horizontal=2)
+    return figure
+
+
+def draw_crops(batch: "Batch") -> "Figure":
+    """A page of B colour crops, eight a row, each beside itself with its true joints."""
+    number, columns = len(batch["rgb"]), 8
+    figure, axes = _page(number, columns, 2, 2.0 * columns, 1.6 * -(-number // columns))
+    keypoints = project(batch["joints"], batch["rgb_camera"]).numpy()
+    for (plain, marked), crop, joints in zip(axes, batch["rgb"].permute(0, 2, 3, 1).numpy(), keypoints):
+        for axis in (plain, marked):
+            axis.imshow(crop)
+        marked.plot(*bone_lines(joints).T, color=_TRUE, lw=1.0, marker=".", ms=3)
+        marked.set(xlim=plain.get_xlim(), ylim=plain.get_ylim())
     return figure

@@ -1,5 +1,7 @@
 """Training losses."""
 
+from collections.abc import Sequence
+
 from torch import Tensor
 
 LOSSES = ("squared", "distance")
@@ -61,3 +63,29 @@ def mesh_loss(pred: Tensor, target: Tensor, loss: str = "squared") -> Tensor:
     offset = pred - target
     distances = offset.square().sum(-1) if loss == "squared" else _distances(offset)
     return distances.mean((1, 2)).sum()
+
+
+def heatmap_loss(
+    heatmaps: Sequence[Tensor], targets: Sequence[Tensor], is_seen: Tensor, hard_keypoints: int
+) -> Tensor:
+    """Return CPN's loss (Chen et al. 2018): half of the mean over GlobalNet's levels, plus RefineNet's hardest joints.
+
+    A joint's loss is its map's mean squared difference; averages are over joints and samples. It is small on purpose:
+    RAdam's first steps are as large as the gradient, and of sums over the cells they would be the last.
+
+    Args:
+        heatmaps: GlobalNet's, then RefineNet's as the last, `(B, K, h, w)` each.
+        targets: The same shapes.
+        is_seen: `(B, K)` bool: the joints that count.
+        hard_keypoints: How many joints of a sample count for RefineNet, those with the largest loss.
+
+    Returns:
+        Scalar.
+    """
+    losses = [
+        (maps - target).square().mean((-2, -1)) * is_seen
+        for maps, target in zip(heatmaps, targets, strict=True)
+    ]
+    *levels, refined = losses
+    hardest = refined.topk(hard_keypoints, -1).values
+    return 0.5 * sum(level.mean() for level in levels) / len(levels) + hardest.mean()

@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 
 from datamodules.placement import draw_heading, place
+from datamodules.posing import varied_camera
 from datamodules.sources.embedded import EmbeddedSource
-from datamodules.synthesis import varied_camera
 from ljn.body import GENDERS, BodyModel, SparseSMPL, load_body_models
 from ljn.geometry.camera import Camera
 from ljn.geometry.rotations import body_to_camera, rotation_about, rotmat_to_rotvec, rotvec_to_rotmat

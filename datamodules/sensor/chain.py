@@ -4,7 +4,7 @@ import math
 from collections.abc import Iterator, Mapping
 from dataclasses import MISSING, dataclass, fields
 from functools import cached_property
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
@@ -101,6 +101,9 @@ class Sensor:
         varies: Whether each step of each sample has a strength of its own, uniform from 0 to `strength`.
     """
 
+    base: ClassVar[type[Step]] = Step
+    methods: ClassVar[tuple[str, ...]] = ("turn", "shape", "dress", "expose")
+
     steps: Mapping[str, Step]
     strength: float = 1.0
     varies: bool = False
@@ -182,7 +185,7 @@ class Sensor:
             method: [
                 (place, step)
                 for place, step in enumerate(self.steps.values())
-                if getattr(type(step), method) is not getattr(Step, method)
+                if getattr(type(step), method, None) not in (None, getattr(self.base, method))
             ]
-            for method in ("turn", "shape", "dress", "expose")
+            for method in self.methods
         }

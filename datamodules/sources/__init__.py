@@ -2,17 +2,20 @@
 
 import hashlib
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 import numpy as np
+import torch
 
 from datamodules.scenes import Scene
 from ljn.body import BodyModel
+from ljn.body.kinematics import without_heading
 from ljn.body.skeleton import NUM_JOINTS
 from ljn.data import SPLITS, Finding
+from ljn.geometry.rotations import BODY_TO_OPENGL, rotmat_to_rotvec, rotvec_to_rotmat
 
 __all__ = ["SPLITS", "Examinable", "ImageSource", "PoseRecords", "PoseSource"]
 
@@ -69,6 +72,14 @@ class PoseRecords:
 
         kinds = [kind(name) for name in self.sequence.tolist()]
         return np.array(kinds, dtype=str)
+
+    def without_heading(self) -> "PoseRecords":
+        """The same records with headings dropped, for others to be drawn; themselves where they have none."""
+        if not self.has_heading:
+            return self
+        rotmat = BODY_TO_OPENGL @ rotvec_to_rotmat(torch.from_numpy(self.pose[:, :3]).double())
+        root = rotmat_to_rotvec(BODY_TO_OPENGL.T @ without_heading(rotmat)).numpy().astype(np.float32)
+        return replace(self, pose=np.concatenate([root, self.pose[:, 3:]], 1), has_heading=False)
 
     @cached_property
     def hash(self) -> str:

@@ -61,6 +61,7 @@ class PipelinePredictor:
         name: For tables; None: the weights' name or the detector's run.
         device: Where the networks run.
         body_path: See `Pipeline.load`.
+        keypoint_detector: Finds the keypoints of frames that have none; one that sees depth images.
 
     Raises:
         FileNotFoundError: There is no such file.
@@ -76,6 +77,7 @@ class PipelinePredictor:
         name: str | None = None,
         device: str = "cpu",
         body_path: str | Path | None = None,
+        keypoint_detector: str | Path | None = None,
     ) -> None:
         if (weights is None) == (ckpt_path is None):
             raise ValueError(
@@ -83,15 +85,27 @@ class PipelinePredictor:
                 "ckpt_path=DETECTOR.ckpt and, for meshes, mesh_ckpt_path=MESH.ckpt"
             )
         if weights is not None:
-            self.pipeline = Pipeline.from_pretrained(weights, device, body_path, refine)
+            self.pipeline = Pipeline.from_pretrained(
+                weights, device, body_path, refine, keypoint_detector=keypoint_detector
+            )
             self.name = name or Path(weights).name.removesuffix(SUFFIX)
         elif ckpt_path is not None:
-            self.pipeline = Pipeline.load(ckpt_path, mesh_ckpt_path, device, body_path, refine)
+            self.pipeline = Pipeline.load(
+                *(ckpt_path, mesh_ckpt_path, device, body_path, refine), keypoint_detector=keypoint_detector
+            )
             self.name = name or str(self.pipeline.detector.origin["run"])
         refined = self.pipeline.refiner is not None
         if refined and name is None:
             self.name += " refined" if refine in (True, "accurate") else f" refined ({refine})"
-        stages = [self.pipeline.detector, self.pipeline.regressor]
+        finder = self.pipeline.finder
+        if finder is not None and finder.sees != "depth":
+            raise ValueError(
+                f"keypoint_detector: '{keypoint_detector}' looks at colours, and the frames have none; give one that "
+                "sees depth images"
+            )
+        if finder is not None and name is None:
+            self.name += " with found keypoints"
+        stages = [self.pipeline.detector, self.pipeline.regressor, finder.stage if finder else None]
         self.fingerprint = " ".join(
             [
                 *(str(stage.origin["hash"]) for stage in stages if stage is not None),
@@ -133,13 +147,13 @@ class PipelinePredictor:
         return joints, vertices
 
     def _predict(self, frames: Sequence[BenchFrame]) -> tuple[np.ndarray, np.ndarray | None]:
-        observed = [
-            self.pipeline.observe_body(
-                find_person(frame.depth, frame.camera).depth,
-                *(frame.camera, _filled(frame.keypoints), frame.num_points),
-            )
-            for frame in frames
-        ]
+        observed = []
+        for frame in frames:
+            depth = find_person(frame.depth, frame.camera).depth
+            keypoints = _filled(frame.keypoints)
+            if keypoints is None and self.pipeline.finder is not None:
+                keypoints = self.pipeline.finder(depth, frame.camera)
+            observed.append(self.pipeline.observe_body(depth, frame.camera, keypoints, frame.num_points))
         given = [frame.joints for frame in frames if frame.joints is not None]
         found = self.pipeline.predict(observed, np.stack(given) if given else None)
         is_of_mesh = bool(given) or self.pipeline.refiner is not None

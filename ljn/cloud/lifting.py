@@ -26,15 +26,21 @@ def lift_keypoints(keypoints: np.ndarray, depth: np.ndarray, camera: Camera) -> 
     Raises:
         ValueError: The mask is empty, or a keypoint is not finite.
     """
+    borrowed = depth_at(keypoints, depth)
+    lifted = back_project(
+        torch.from_numpy(np.asarray(keypoints, np.float32)), torch.from_numpy(borrowed), camera.intrinsics()
+    )
+    return lifted.numpy()
+
+
+def depth_at(keypoints: np.ndarray, depth: np.ndarray) -> np.ndarray:
+    """The depth of the body pixel nearest to each keypoint: `(K,)` float32, metres; see `lift_keypoints`."""
     if not np.isfinite(keypoints).all():
         raise ValueError("keypoints: NaN or infinite values; every keypoint needs a position in pixels")
     borrowed = _nearest_depth(depth, np.ascontiguousarray(keypoints, dtype=np.float64))
     if (borrowed == 0).any():
         raise ValueError("depth: the mask is empty, there is no depth to lift the keypoints with")
-    lifted = back_project(
-        torch.from_numpy(np.asarray(keypoints, np.float32)), torch.from_numpy(borrowed), camera.intrinsics()
-    )
-    return lifted.numpy()
+    return borrowed
 
 
 @numba.njit(cache=True, nogil=True)

@@ -88,6 +88,21 @@ def back_project(pixels: Tensor, depth: Tensor, intrinsics: Tensor) -> Tensor:
     return torch.cat([(pixels - centre) / focal * depth, depth], -1)
 
 
+def transfer(pixels: Tensor, intrinsics: Tensor, other: Tensor) -> Tensor:
+    """Pixels of one image in another of the same camera frame, such as those of a crop in the whole.
+
+    Args:
+        pixels: `(..., N, 2)`, pixels.
+        intrinsics: `(..., 4)`: fx, fy, cx, cy of their image.
+        other: `(..., 4)`, those of the other image.
+
+    Returns:
+        `(..., N, 2)`, pixels of the other image.
+    """
+    focal, centre = intrinsics[..., None, :2], intrinsics[..., None, 2:]
+    return (pixels - centre) / focal * other[..., None, :2] + other[..., None, 2:]
+
+
 def place_at_root(points: Tensor, root: Tensor, camera_root: Tensor) -> Tensor:
     """Points of a body before the camera: R M + T' of Eq. 4.1, where T' (Eq. 4.2) takes the root where it is seen.
 

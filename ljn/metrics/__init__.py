@@ -5,6 +5,7 @@ from ljn.metrics.functional import (
     apve_procrustes,
     apve_root_aligned,
     exchanged,
+    exchanged_2d,
     harmed,
     joint_errors_mm,
     keypoint_distances_px,
@@ -12,19 +13,24 @@ from ljn.metrics.functional import (
     mpjpe_eq38,
     mpjpe_procrustes,
     mpjpe_root_aligned,
+    object_keypoint_similarity,
     pckh,
+    pckh_2d,
     pckh_root_aligned,
     pckh_threshold_mm,
 )
 from ljn.metrics.joints import JointMetrics
+from ljn.metrics.keypoints import KeypointMetrics
 from ljn.metrics.meshes import MeshMetrics, RefinedMeshMetrics
-from ljn.metrics.samples import Quantity, SampleMax, SampleMean, SampleMetric, StageMetrics
+from ljn.metrics.samples import Quantity, SampleAP, SampleMax, SampleMean, SampleMetric, StageMetrics
 
 __all__ = [
     "JointMetrics",
+    "KeypointMetrics",
     "MeshMetrics",
     "Quantity",
     "RefinedMeshMetrics",
+    "SampleAP",
     "SampleMax",
     "SampleMean",
     "SampleMetric",
@@ -33,6 +39,7 @@ __all__ = [
     "apve_procrustes",
     "apve_root_aligned",
     "exchanged",
+    "exchanged_2d",
     "harmed",
     "joint_errors_mm",
     "keypoint_distances_px",
@@ -40,7 +47,9 @@ __all__ = [
     "mpjpe_eq38",
     "mpjpe_procrustes",
     "mpjpe_root_aligned",
+    "object_keypoint_similarity",
     "pckh",
+    "pckh_2d",
     "pckh_root_aligned",
     "pckh_threshold_mm",
 ]

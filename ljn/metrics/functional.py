@@ -4,12 +4,20 @@ Joints come in metres and errors go out in millimetres, percentages in 0-100. Na
 sample, in PCKh too, where a comparison with NaN would count as an ordinary miss.
 """
 
+import torch
 from torch import Tensor
 
-from ljn.body.skeleton import HEAD_BONE, MIRROR, NUM_JOINTS, ROOT
+from ljn.body.skeleton import HEAD_BONE, JOINT_NAMES, MIRROR, NUM_JOINTS, ROOT
 from ljn.geometry.alignment import procrustes_align, root_align
 
 MM_PER_METRE = 1000.0
+_OKS_SIGMAS = {
+    "pelvis": 0.107, "hip": 0.107, "spine1": 0.107, "spine2": 0.107, "spine3": 0.107, "neck": 0.079, "collar": 0.079,
+    "shoulder": 0.079, "head": 0.079, "elbow": 0.072, "wrist": 0.062, "hand": 0.062, "knee": 0.087, "ankle": 0.089,
+    "foot": 0.089,
+}  # fmt: skip
+"""COCO's constants; of the joints that COCO does not know, those of the nearest joint."""
+_OKS_AREA = 0.53  # of a person, as a share of the box, as COCO's tools take it where there is no outline
 
 
 def joint_errors_mm(pred: Tensor, target: Tensor) -> Tensor:
@@ -194,16 +202,83 @@ def harmed(raw: Tensor, refined: Tensor, target: Tensor, limit_mm: float = 5.0) 
 
 
 def keypoint_distances_px(noisy: Tensor, clean: Tensor) -> Tensor:
-    """Return how far the noise has moved each 2D keypoint.
+    """Return how far each 2D keypoint lies from the true one.
 
     Args:
-        noisy: `(..., K, 2)`, pixels.
+        noisy: `(..., K, 2)`, pixels, with noise or predicted.
         clean: `(..., K, 2)`, pixels.
 
     Returns:
         `(..., K)`, pixels, float64.
     """
     return _distances(noisy, clean, size=2)
+
+
+def pckh_2d(pred: Tensor, target: Tensor, joints: Tensor, focal_px: Tensor) -> Tensor:
+    """Return PCKh@0.5 in the image: half the true head bone, turned across the view at its depth, is the threshold.
+
+    The head bone's own length in the image, which other data sets take, goes to zero where a person looks at the camera
+    from below.
+
+    Args:
+        pred: `(B, 24, 2)`, pixels.
+        target: `(B, 24, 2)`, pixels.
+        joints: `(B, 24, 3)`, the true joints, metres, camera frame.
+        focal_px: `(B,)`, pixels.
+
+    Returns:
+        `(B,)`, %, float64.
+    """
+    depth = joints[:, list(HEAD_BONE), 2].double().mean(-1)
+    threshold = pckh_threshold_mm(joints) / MM_PER_METRE * focal_px / depth
+    errors = keypoint_distances_px(pred, target)
+    correct = (errors < threshold[:, None]).to(errors.dtype)
+    return 100.0 * correct.where(~errors.isnan(), errors).mean(-1)
+
+
+def object_keypoint_similarity(pred: Tensor, target: Tensor) -> Tensor:
+    """Return COCO's OKS: the mean over the joints of exp(-d^2 / (2 A k^2)), A 0.53 of the true keypoints' box.
+
+    Args:
+        pred: `(..., 24, 2)`, pixels.
+        target: `(..., 24, 2)`, pixels.
+
+    Returns:
+        `(...)`, 0 to 1, float64.
+    """
+    sigmas = [_OKS_SIGMAS[name.rpartition("_")[2]] for name in JOINT_NAMES]
+    variances = (2 * torch.tensor(sigmas, dtype=torch.float64, device=target.device)).square()
+    box = target.double().amax(-2) - target.double().amin(-2)
+    area = _OKS_AREA * box.prod(-1)
+    errors = keypoint_distances_px(pred, target)
+    return torch.exp(-errors.square() / (2 * area[..., None] * variances)).mean(-1)
+
+
+def scored_similarity(pred: Tensor, target: Tensor, confidences: Tensor) -> Tensor:
+    """Return OKS and the score by which predictions are ranked, the mean confidence: `(B, 2)`, float64.
+
+    Args:
+        pred: `(B, 24, 2)`, pixels.
+        target: `(B, 24, 2)`, pixels.
+        confidences: `(B, 24)`.
+    """
+    return torch.stack([object_keypoint_similarity(pred, target), confidences.double().mean(-1)], -1)
+
+
+def exchanged_2d(pred: Tensor, target: Tensor) -> Tensor:
+    """Return whether keypoints fit better with left and right exchanged: a left-right flip.
+
+    Args:
+        pred: `(..., 24, 2)`, pixels.
+        target: `(..., 24, 2)`, pixels.
+
+    Returns:
+        `(...)`, 100 or 0 (%), float64.
+    """
+    errors, others = (
+        keypoint_distances_px(each, target).mean(-1) for each in (pred, pred[..., list(MIRROR), :])
+    )
+    return (100.0 * (others < errors)).to(errors.dtype).where(~errors.isnan(), errors)
 
 
 def _distances(first: Tensor, second: Tensor, size: int) -> Tensor:

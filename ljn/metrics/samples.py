@@ -84,6 +84,55 @@ class SampleMax(SampleMetric):
         return self.maximum.where(~self.maximum.isneginf(), torch.nan)
 
 
+class SampleAP(SampleMetric):
+    """COCO's average precision of one prediction for each sample, mean over the thresholds 0.5, 0.55, ..., 0.95, in
+    percent; see `SampleMetric`.
+
+    Predictions are ranked by their score; precision is made to fall monotonically and read at 101 recalls.
+    """
+
+    results: list[Tensor]
+
+    def __init__(self, unit: str, goal: Goal | None = "max") -> None:
+        super().__init__(unit, goal)
+        self.add_state("results", [], dist_reduce_fx="cat")
+
+    def each(self, values: Tensor) -> Tensor:
+        """A sample's own: the share of the thresholds that its similarity reaches, in percent."""
+        return 100 * (values[:, :1] >= _thresholds(values)).double().mean(-1).where(
+            ~values[:, 0].isnan(), torch.nan
+        )
+
+    def update(self, values: Tensor) -> None:
+        """Add a batch: `(B, 2)`, similarity and score, float64."""
+        self.results.append(values)
+
+    def compute(self) -> Tensor:
+        """Return the average precision, a float64 scalar."""
+        results: Any = self.results
+        if isinstance(results, list):
+            if not results:
+                return torch.tensor(torch.nan, dtype=torch.float64)
+            results = torch.cat(results)
+        if results.isnan().any():
+            return torch.tensor(torch.nan, dtype=torch.float64)
+        ranked = results[results[:, 1].argsort(descending=True, stable=True), 0]
+        hits = (ranked[:, None] >= _thresholds(ranked)).double().cumsum(0)  # (S, T)
+        places = torch.arange(1, len(ranked) + 1, dtype=torch.float64, device=ranked.device)[:, None]
+        recall, precision = hits / len(ranked), hits / places
+        precision = precision.flip(0).cummax(0).values.flip(0)
+        wanted = torch.linspace(0, 1, 101, dtype=torch.float64, device=ranked.device)
+        place = torch.searchsorted(
+            recall.T.contiguous(), wanted.expand(recall.shape[1], -1).contiguous()
+        )  # (T, 101)
+        read = precision.T.gather(1, place.clamp(max=len(ranked) - 1))
+        return 100 * torch.where(place < len(ranked), read, 0.0).mean()
+
+
+def _thresholds(like: Tensor) -> Tensor:
+    return torch.linspace(0.5, 0.95, 10, dtype=torch.float64, device=like.device)
+
+
 @dataclass(frozen=True)
 class Quantity:
     """What a metric is of.

@@ -9,8 +9,9 @@ from typing import Any, Generic, NamedTuple, TypeVar
 import numpy as np
 
 from ljn.geometry.camera import Camera
-from ljn.pipeline.inputs import DEPTH_SUFFIXES, read_depth, read_keypoints, read_mask
-from ljn.pipeline.pipeline import Pipeline, Prediction
+from ljn.pipeline.inputs import DEPTH_SUFFIXES, RGB_SUFFIXES, read_depth, read_keypoints, read_mask, read_rgb
+from ljn.pipeline.pipeline import Pipeline
+from ljn.pipeline.prediction import Prediction
 
 FrameT = TypeVar("FrameT")
 
@@ -24,6 +25,7 @@ class FrameImages(NamedTuple):
     depth: Any  # `(H, W)`
     keypoints: Any
     mask: Any = None  # `(H, W)`; None for none
+    rgb: Any = None  # `(H, W, 3)`; None for none
 
 
 class FrameFiles(NamedTuple):
@@ -34,6 +36,7 @@ class FrameFiles(NamedTuple):
     keypoints: Path | None
     mask: Path | None
     mask_id: int | None = None  # of an index map, the person's number
+    rgb: Path | None = None
 
     def read(self) -> FrameImages:
         """What the files hold.
@@ -44,7 +47,8 @@ class FrameFiles(NamedTuple):
         """
         mask = None if self.mask is None else read_mask(self.mask, self.mask_id)
         keypoints = None if self.keypoints is None else read_keypoints(self.keypoints)
-        return FrameImages(read_depth(self.depth), keypoints, mask)
+        rgb = None if self.rgb is None else read_rgb(self.rgb)
+        return FrameImages(read_depth(self.depth), keypoints, mask, rgb)
 
 
 class FrameResult(NamedTuple, Generic[FrameT]):
@@ -75,7 +79,9 @@ def predict_frames(
         for frame in batch:
             try:
                 images = read(frame)
-                observed = pipeline.observe(images.depth, camera, images.keypoints, images.mask)
+                observed = pipeline.observe(
+                    images.depth, camera, images.keypoints, images.mask, rgb=images.rgb
+                )
                 observations.append(observed)
                 results.append(FrameResult(frame, depth=observed.depth))
             except (ValueError, FileNotFoundError) as error:
@@ -93,8 +99,9 @@ def find_frames(
     keypoints: str | Path | None = None,
     mask: str | Path | None = None,
     mask_id: int | None = None,
+    rgb: str | Path | None = None,
 ) -> list[FrameFiles]:
-    """The frames of a depth image, or of a folder of them; with keypoints and masks of the same stem in theirs.
+    """The frames of a depth image, or of a folder of them; with keypoints, masks and colour images of the same stem.
 
     Keypoints may also be named as OpenPose does: `STEM_keypoints.json`; `STEM_000000000012_keypoints.json`, if that is
     the only one of its stem; or, of a video, any name with the number of a frame, if these are those that the depth
@@ -104,18 +111,19 @@ def find_frames(
         FileNotFoundError: There is no such file or folder, or no depth image in it.
         ValueError: Files and folders are mixed, or two depth images share a stem.
     """
-    given = {"input": input, "keypoints": keypoints, "mask": mask}
+    given = {"input": input, "keypoints": keypoints, "mask": mask, "rgb": rgb}
     paths = {name: Path(path) for name, path in given.items() if path}
     for name, path in paths.items():
         if not path.exists():
             raise FileNotFoundError(f"{name}: no file or folder '{path}'")
     if len({path.is_dir() for path in paths.values()}) > 1:
         kinds = (f"{name} is a {'folder' if path.is_dir() else 'file'}" for name, path in paths.items())
-        raise ValueError(f"input, keypoints, mask: expected files or folders alike, got: {', '.join(kinds)}")
+        raise ValueError(f"{', '.join(paths)}: expected files or folders alike, got: {', '.join(kinds)}")
     if not paths["input"].is_dir():
         return [
             FrameFiles(
-                paths["input"].stem, paths["input"], paths.get("keypoints"), paths.get("mask"), mask_id
+                *(paths["input"].stem, paths["input"], paths.get("keypoints"), paths.get("mask")),
+                *(mask_id, paths.get("rgb")),
             )
         ]
     images = sorted(path for path in paths["input"].iterdir() if path.suffix.lower() in DEPTH_SUFFIXES)
@@ -134,9 +142,22 @@ def find_frames(
             of_stem.get(path.stem),
             paths["mask"] / f"{path.stem}.png" if mask else None,
             mask_id,
+            _rgb_file(paths["rgb"], path.stem) if rgb else None,
         )
         for path in images
     ]
+
+
+def in_order(name: str) -> list[tuple[int, str]]:
+    """What to sort a frame's name by, so that `frame_9` comes before `frame_10`."""
+    parts = re.split(r"([0-9]+)", name)
+    return [(int(part), "") if part.isascii() and part.isdigit() else (-1, part) for part in parts]
+
+
+def _rgb_file(folder: Path, stem: str) -> Path:
+    """The colour image of a depth image; where there is none, that which would be read first."""
+    choices = [folder / f"{stem}{suffix}" for suffix in RGB_SUFFIXES]
+    return next((path for path in choices if path.is_file()), choices[0])
 
 
 def _keypoint_files(folder: Path, stems: Sequence[str]) -> dict[str, Path]:

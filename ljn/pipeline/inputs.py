@@ -12,6 +12,7 @@ from ljn.pipeline.depth import person_mask
 from ljn.reading import READ_ERRORS, brief, read_arrays, read_json, read_yaml, reason, shown
 
 DEPTH_SUFFIXES = (".png", ".npy", ".npz")
+RGB_SUFFIXES = (".png", ".jpg", ".jpeg")
 _GREY = ("1", "L", "I", "I;16", "I;16B", "F")  # Pillow's modes of one channel
 _CAMERA_KEYS = ("fx", "fy", "cx", "cy", "width", "height")
 
@@ -64,6 +65,22 @@ def read_mask(path: str | Path, chosen: int | None = None) -> np.ndarray:
         return person_mask(image, chosen)
     except ValueError as error:
         raise ValueError(f"{error} ('{path}')") from error
+
+
+def read_rgb(path: str | Path) -> np.ndarray:
+    """A colour image `(H, W, 3)` uint8 from a PNG or a JPEG; an alpha channel is left out.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: It cannot be read, or has no colours.
+    """
+    path = _existing(path, "rgb")
+    if path.suffix.lower() not in RGB_SUFFIXES:
+        raise ValueError(f"rgb: expected one of {', '.join(RGB_SUFFIXES)}, got '{path}'")
+    image = _read_image(path, "rgb", ())
+    if image.dtype != np.uint8:
+        raise ValueError(f"rgb: expected 8 bits a channel, '{path}' has {image.dtype}: the depth image?")
+    return image
 
 
 def read_camera(path: str | Path) -> Camera:
@@ -199,17 +216,24 @@ def _camera_number(value: Any, key: str, path: Path) -> float:
 
 
 def _read_png(path: Path, name: str, modes: Sequence[str] = _GREY) -> np.ndarray:
+    """See `_read_image`."""
+    return _read_image(path, name, modes, ("PNG",))
+
+
+def _read_image(
+    path: Path, name: str, modes: Sequence[str], formats: tuple[str, ...] = ("PNG", "JPEG")
+) -> np.ndarray:
     """The image as an array, in RGB unless its mode is one of `modes`."""
     from PIL import Image
 
     bombs: tuple[type[Exception], ...] = (Image.DecompressionBombError, Image.DecompressionBombWarning)
     try:
         # Another format can start a program: PostScript, also in a file called .png, starts Ghostscript.
-        with Image.open(path, formats=("PNG",)) as image:
+        with Image.open(path, formats=formats) as image:
             if image.width * image.height > MAX_PIXELS:
                 raise ValueError(f"{image.width} x {image.height} pixels, expected at most {MAX_PIXELS}")
             image.verify()  # compares all checksums; then it has to be opened anew
-        with Image.open(path, formats=("PNG",)) as image:
+        with Image.open(path, formats=formats) as image:
             return np.asarray(image if image.mode in modes else image.convert("RGB"))
     except (*bombs, *READ_ERRORS) as error:
         raise _unreadable(name, path, error) from error

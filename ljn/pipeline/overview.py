@@ -10,7 +10,7 @@ from ljn.body.skeleton import ROOT
 from ljn.drawing import FROM_THE_SIDE, new_figure
 from ljn.geometry.camera import Camera
 from ljn.pipeline.pictures import MESH, NEAREST_M
-from ljn.pipeline.pipeline import Prediction
+from ljn.pipeline.prediction import Prediction
 from ljn.render import get_renderer
 from ljn.render.shading import shade_mesh
 

@@ -7,7 +7,7 @@ import numpy as np
 from ljn.body.skeleton import ROOT
 from ljn.drawing import FROM_THE_SIDE, add_legend, bone_lines, new_figure
 from ljn.geometry.camera import Camera
-from ljn.pipeline.pipeline import Prediction
+from ljn.pipeline.prediction import Prediction
 from ljn.render.shading import shade_mesh
 
 if TYPE_CHECKING:

@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
@@ -10,92 +10,22 @@ import numpy as np
 import torch
 
 from ljn.body.skeleton import ROOT
-from ljn.cloud.observation import Observation, ObservationRecipe, observe, stack_observations
+from ljn.cloud.observation import Observation, observe, stack_observations
 from ljn.geometry.camera import Camera, place_at_root
 from ljn.geometry.rotations import CAMERA_FROM_BODY, rotmat_to_rotvec
 from ljn.modules.joint_detector import JointDetector
 from ljn.modules.mesh_regressor import MeshRegressor
 from ljn.pipeline.depth import body_depth
+from ljn.pipeline.keypoint_finder import KeypointFinder
 from ljn.pipeline.keypoints import MIN_KNOWN, Keypoints, body_keypoints
+from ljn.pipeline.prediction import Prediction
 from ljn.pipeline.report import Report
+from ljn.pipeline.stages import Stage, load_stage
 from ljn.refinement import Refiner, chosen_settings, refine, second_look
-from ljn.runs.checkpoints import Checkpoint, load_module
 from ljn.runs.packages import DEFAULT, find_package, stages_of
 
 _LOG = logging.getLogger(__name__)
 _SEED = 0  # of the choice of points: the same for every image, so that equal input gives equal output
-
-
-@dataclass(frozen=True)
-class Prediction:
-    """What is found of one person, or, with a leading dimension B, of a batch; camera frame, metres, float32.
-
-    Attributes:
-        joints: `(24, 3)`, the joint detector's.
-        points: `(N, 6)`, the cloud: position and normal.
-        initial_joints: `(24, 3)`, the keypoints lifted with the depth image.
-        keypoints: `(24, 2)`, those of the SMPL joints, pixels.
-        confidences: `(24,)`, the keypoints' own, from 0 to 1; 0 where a keypoint was filled in.
-        vertices: `(V, 3)`, the mesh, its root joint at the detector's (Eq. 4.1-4.2).
-        pose: `(72,)` axis-angle, radians; the first three turn SMPL's rest frame into body world, as in `Batch`.
-        betas: `(10,)`.
-        global_orient: `(3,)` axis-angle, radians, in the camera's axes. It, the body's pose `pose[3:]`, `betas` and
-            `transl` give any SMPL layer the same vertices in the camera frame.
-        transl: `(3,)`, the translation of an SMPL layer.
-        faces: `(F, 3)` int64, vertex indices; of a batch, too.
-        mesh_joints: `(24, 3)`, the mesh's own joints.
-        is_refined: Whether mesh, pose and shape are fitted to the depth; false where the fit was given up.
-        residual_mm: `(2,)`, median distance of the cloud's points to the mesh, as guessed and as returned.
-        report: What was found in the input, and done about it; of a batch, one for each image.
-
-    Without keypoints, `initial_joints`, `keypoints` and `confidences` are None; without a mesh regressor, `vertices`,
-    `pose`, `betas`, `global_orient`, `transl`, `faces` and `mesh_joints`; without refinement, `is_refined` and
-    `residual_mm`. With it, the mesh is placed where it fits, and `joints` are those that the fit began with.
-    """
-
-    joints: np.ndarray
-    points: np.ndarray
-    initial_joints: np.ndarray | None = None
-    keypoints: np.ndarray | None = None
-    confidences: np.ndarray | None = None
-    vertices: np.ndarray | None = None
-    pose: np.ndarray | None = None
-    betas: np.ndarray | None = None
-    faces: np.ndarray | None = None
-    mesh_joints: np.ndarray | None = None
-    is_refined: np.ndarray | None = None
-    residual_mm: np.ndarray | None = None
-    global_orient: np.ndarray | None = None
-    transl: np.ndarray | None = None
-    report: Report | tuple[Report, ...] = ()
-
-    @property
-    def arrays(self) -> dict[str, np.ndarray]:
-        """All arrays that there are, by name."""
-        return {name: value for name, value in vars(self).items() if isinstance(value, np.ndarray)}
-
-    def __getitem__(self, index: int) -> Self:
-        """One of a batch."""
-        values = {field.name: getattr(self, field.name) for field in fields(self)}
-        chosen = {
-            name: value if value is None or name == "faces" or len(value) == 0 else value[index]
-            for name, value in values.items()
-        }
-        return type(self)(**chosen)
-
-
-class Stage(NamedTuple):
-    """A trained module, how its observations are made, and where it comes from.
-
-    Attributes:
-        module: A `JointDetector` or a `MeshRegressor`.
-        recipe: How the observations of its training were made.
-        origin: Path, hash, run and epoch of its checkpoint: for records.
-    """
-
-    module: Any
-    recipe: ObservationRecipe
-    origin: dict[str, Any]
 
 
 class ObservedFrame(NamedTuple):
@@ -131,6 +61,7 @@ class Pipeline:
         refine: Whether meshes are fitted to the depth, and how: see `ljn.refinement`. True is "accurate".
         strict: Whether a doubt about the input, which otherwise is logged and goes into the prediction's report, is an
             error.
+        finder: Finds the keypoints of images for which none are given; None: the detector does without.
 
     Raises:
         ValueError: There is no such setting, or no mesh to refine.
@@ -142,9 +73,11 @@ class Pipeline:
         regressor: Stage | None = None,
         refine: bool | str | None = None,
         strict: bool = False,
+        finder: KeypointFinder | None = None,
     ) -> None:
         self.detector = detector
         self.regressor = regressor
+        self.finder = finder
         self.is_strict = strict
         self.refiner: Refiner | None = None
         if (settings := chosen_settings(refine)) is not None:
@@ -163,6 +96,7 @@ class Pipeline:
         body_path: str | Path | None = None,
         refine: bool | str | None = None,
         strict: bool = False,
+        keypoint_detector: str | Path | None = None,
     ) -> Self:
         """The pipeline of two checkpoints.
 
@@ -174,29 +108,31 @@ class Pipeline:
                 embedded; None: where it was in the training.
             refine: See the class.
             strict: See the class.
+            keypoint_detector: Of images for which no keypoints are given: a keypoint detector's checkpoint, a package's
+                file, or the name of one that ships; None: the joint detector does without.
 
         Raises:
             FileNotFoundError: There is no such file.
-            ValueError: A checkpoint is damaged or of the other stage, or the two belong to different bodies.
+            ValueError: A checkpoint is damaged or of another stage, or the two belong to different bodies.
         """
-        module, checkpoint = load_module(detector_ckpt, JointDetector, "detector_ckpt")
-        detector = _stage(module.to(device), checkpoint)
+        detector, checkpoint = load_stage(detector_ckpt, JointDetector, "detector_ckpt", device)
+        finder = None if keypoint_detector is None else KeypointFinder.load(keypoint_detector, device)
         if mesh_ckpt is None:
-            return cls(detector, refine=refine, strict=strict)
-        module, mesh_checkpoint = load_module(mesh_ckpt, MeshRegressor, "mesh_ckpt", body_path)
+            return cls(detector, refine=refine, strict=strict, finder=finder)
+        regressor, mesh_checkpoint = load_stage(mesh_ckpt, MeshRegressor, "mesh_ckpt", device, body_path)
         if unknown := mesh_checkpoint.unknown_bodies(checkpoint.body_hash.split("-")):
             raise ValueError(
                 f"mesh_ckpt: '{mesh_ckpt}' was trained with the bodies {mesh_checkpoint.body_hash}, and {unknown[0]} "
                 f"of '{detector_ckpt}' is not among them; joints of one body do not fit another's mesh: give two "
                 "checkpoints trained with the same bodies"
             )
-        if unknown := mesh_checkpoint.unknown_bodies(module.body_hashes):
+        if unknown := mesh_checkpoint.unknown_bodies(regressor.module.body_hashes):
             raise ValueError(
                 f"mesh_ckpt: '{mesh_ckpt}' was trained with the bodies {mesh_checkpoint.body_hash}, but the body found "
                 f"here is {unknown[0]}; give the training's body file (body.path=FILE, in Python body_path=FILE), or "
                 "use the version of this library whose embedded body it was"
             )
-        return cls(detector, _stage(module.to(device), mesh_checkpoint), refine, strict)
+        return cls(detector, regressor, refine, strict, finder)
 
     @classmethod
     def from_pretrained(
@@ -206,6 +142,7 @@ class Pipeline:
         body_path: str | Path | None = None,
         refine: bool | str | None = None,
         strict: bool = False,
+        keypoint_detector: str | Path | None = None,
     ) -> Self:
         """The pipeline of trained weights that ship in one file, a package.
 
@@ -216,6 +153,7 @@ class Pipeline:
             body_path: See `load`.
             refine: See the class.
             strict: See the class.
+            keypoint_detector: See `load`.
 
         Raises:
             FileNotFoundError: There is no such file.
@@ -224,15 +162,17 @@ class Pipeline:
         """
         path = find_package(name, "name")
         mesh = path if "mesh" in stages_of(path, "name") else None
-        return cls.load(path, mesh, device, body_path, refine, strict)
+        return cls.load(path, mesh, device, body_path, refine, strict, keypoint_detector)
 
     @property
     def needs_keypoints(self) -> bool:
-        """Whether the joint detector cannot do without 2D keypoints."""
+        """Whether 2D keypoints have to be given: the joint detector takes them, and nobody finds them."""
         takes = self.detector.module.takes
-        return "initial_joints" in takes and "confidences" not in takes
+        return self.finder is None and "initial_joints" in takes and "confidences" not in takes
 
-    def __call__(self, depth: Any, camera: Camera, keypoints: Any = None, mask: Any = None) -> Prediction:
+    def __call__(
+        self, depth: Any, camera: Camera, keypoints: Any = None, mask: Any = None, rgb: Any = None
+    ) -> Prediction:
         """Predict from one image, or from a batch of one camera's images.
 
         Args:
@@ -242,26 +182,28 @@ class Pipeline:
             keypoints: See `body_keypoints`; of a batch, one such value for each image. None, or some of them alone, for
                 a detector that can do without.
             mask: Of an image, or a batch's: see `person_mask`; None where depth is 0 everywhere else already.
+            rgb: Of an image, or a batch's: the registered colour image, see `KeypointFinder`; looked at where keypoints
+                are to be found in it.
 
         Raises:
             ValueError: The input is wrong; the message says how, and of which image of a batch.
         """
         depth = np.asarray(depth)
         if depth.ndim != 3 or depth.shape == (camera.height, camera.width, 1):
-            return self.predict([self.observe(depth, camera, keypoints, mask)])[0]
+            return self.predict([self.observe(depth, camera, keypoints, mask, rgb=rgb)])[0]
         if len(depth) == 0:
             raise ValueError("depth: expected at least one image, got a batch of none")
-        masks = [None] * len(depth) if mask is None else mask
-        keypoints = [None] * len(depth) if keypoints is None else keypoints
-        if not len(depth) == len(keypoints) == len(masks):
+        none = [None] * len(depth)
+        keypoints, masks, colours = (none if each is None else each for each in (keypoints, mask, rgb))
+        if not len(depth) == len(keypoints) == len(masks) == len(colours):
             raise ValueError(
-                f"depth, keypoints, mask: expected one of each for every image, got {len(depth)} images, "
-                f"{len(keypoints)} keypoints and {len(masks)} masks"
+                f"depth, keypoints, mask, rgb: expected one of each for every image, got {len(depth)} images, "
+                f"{len(keypoints)} keypoints, {len(masks)} masks and {len(colours)} colour images"
             )
         observations = []
-        for number, arguments in enumerate(zip(depth, keypoints, masks)):
+        for number, (image, *others, colour) in enumerate(zip(depth, keypoints, masks, colours)):
             try:
-                observations.append(self.observe(arguments[0], camera, *arguments[1:]))
+                observations.append(self.observe(image, camera, others[0], others[1], rgb=colour))
             except ValueError as error:
                 raise ValueError(f"image {number} of the batch: {error}") from error
         return self.predict(observations)
@@ -273,6 +215,7 @@ class Pipeline:
         keypoints: Any = None,
         mask: Any = None,
         report: Report | None = None,
+        rgb: Any = None,
     ) -> ObservedFrame:
         """Check one image's input and observe it for each stage; arguments as in a call.
 
@@ -284,10 +227,16 @@ class Pipeline:
         if keypoints is not None:
             min_known = MIN_KNOWN if self.needs_keypoints else 1
             named = body_keypoints(keypoints, metres, camera, min_known, report)
+        elif self.finder is not None:
+            named = self.finder(metres, camera, rgb)
+            report.note(
+                keypoints_found_in=self.finder.sees, keypoints_unsure=int((named.confidences == 0).sum())
+            )
         elif self.needs_keypoints:
             raise ValueError(
                 "keypoints: expected the person's 2D keypoints, which this joint detector takes, got none; give them, "
-                "or a detector that can do without: experiment=detector/cascade"
+                "a keypoint detector that finds them, or a joint detector that can do without: "
+                "experiment=detector/cascade"
             )
         for warning in report.warnings:
             _LOG.warning("%s", warning)
@@ -370,7 +319,7 @@ class Pipeline:
 
         rotmats, betas = regress(_on(regressor.device, seen) | {"initial_joints": joints})
         root = joints[:, ROOT]
-        made = {}
+        made: dict[str, torch.Tensor] = {}
         if self.refiner is not None:
             detector = self.detector.module
             # A second look at points alone would be at those of the detector's recipe.
@@ -382,34 +331,33 @@ class Pipeline:
             )
             rotmats, betas, root = refined.rotmats, refined.betas, refined.root
             made = {"is_refined": refined.is_kept, "residual_mm": refined.residual_mm}
-        body = regressor.body.from_rotmats(rotmats, betas)
-        made |= {
+        made |= self.meshes(rotmats, betas, root)
+        return made, joints
+
+    def meshes(
+        self, rotmats: torch.Tensor, betas: torch.Tensor, root: torch.Tensor
+    ) -> dict[str, torch.Tensor]:
+        """The arrays of a `Prediction` that are of its mesh, from its parameters, all on the regressor's device.
+
+        Args:
+            rotmats: `(B, 24, 3, 3)`, the joints' rotations; the first leads from SMPL's rest frame to body world.
+            betas: `(B, 10)`.
+            root: `(B, 3)`, the root joint, metres, camera frame.
+        """
+        assert self.regressor is not None
+        layer = self.regressor.module.body
+        body = layer.from_rotmats(rotmats, betas)
+        return {
             "vertices": place_at_root(body.vertices, body.joints[:, ROOT], root),
             "mesh_joints": place_at_root(body.joints, body.joints[:, ROOT], root),
             "pose": rotmat_to_rotvec(rotmats).flatten(-2),
             "betas": betas,
             "global_orient": rotmat_to_rotvec(CAMERA_FROM_BODY.to(rotmats) @ rotmats[:, 0]),
-            "transl": root
-            - body.joints[:, ROOT],  # an SMPL layer turns a body about its root, and then moves it
-            "faces": regressor.body.faces,
+            # An SMPL layer turns a body about its root, and then moves it.
+            "transl": root - body.joints[:, ROOT],
+            "faces": layer.faces,
         }
-        return made, joints
 
 
 def _on(device: torch.device, tensors: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
     return {name: value.to(device) for name, value in tensors.items()}
-
-
-def _stage(module: Any, checkpoint: Checkpoint) -> Stage:
-    if checkpoint.recipe is None:
-        raise ValueError(
-            f"'{checkpoint.path}': it was not trained on observations of depth images, so none can be made for it"
-        )
-    origin = {
-        "path": str(checkpoint.path),
-        "hash": checkpoint.file_hash,
-        "run": checkpoint.run,
-        "epoch": checkpoint.epoch,
-        "body_hash": checkpoint.body_hash,
-    }
-    return Stage(module, checkpoint.recipe, origin)

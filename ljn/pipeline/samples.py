@@ -15,7 +15,7 @@ from ljn.body.skeleton import NUM_JOINTS, ROOT
 from ljn.geometry.camera import Camera, place_at_root
 from ljn.pipeline.frames import FrameFiles, find_frames
 from ljn.pipeline.inputs import read_camera
-from ljn.pipeline.pipeline import Prediction
+from ljn.pipeline.prediction import Prediction
 from ljn.reading import READ_ERRORS, read_arrays, reason
 
 CAMERA, DEPTH, KEYPOINTS, TRUTH = "camera.yaml", "depth", "keypoints", "truth"

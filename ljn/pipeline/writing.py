@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from ljn.geometry.camera import Camera
-from ljn.pipeline.pipeline import Prediction
+from ljn.pipeline.prediction import Prediction
 
 _GLTF_FROM_CAMERA = np.array([1.0, -1.0, -1.0])
 

@@ -16,6 +16,7 @@ from torch.nn.modules.module import register_module_parameter_registration_hook
 
 from ljn.building import build, check_targets, with_moved_targets
 from ljn.cloud.observation import ObservationRecipe
+from ljn.cloud.rgb import RgbRecipe
 from ljn.geometry.camera import Camera
 from ljn.modules.base import StageModule
 from ljn.reading import READ_ERRORS, brief, check_archive, plain_values, reason, shown
@@ -42,7 +43,7 @@ class Provenance(Callback):
         body_hash: str,
         data_licence: str,
         run: str,
-        recipe: ObservationRecipe | None,
+        recipe: ObservationRecipe | RgbRecipe | None,
     ) -> None:
         self.content = {
             "version": CHECKPOINT_VERSION,
@@ -50,7 +51,7 @@ class Provenance(Callback):
             "body_hash": body_hash,
             "data_licence": data_licence,
             "run": run,
-            "observation": None if recipe is None else asdict(recipe),
+            "observation": None if recipe is None else _plain_recipe(recipe),
         }
 
     def on_save_checkpoint(self, trainer: Any, pl_module: Any, checkpoint: dict[str, Any]) -> None:
@@ -89,7 +90,7 @@ class Checkpoint:
     run: str  # name of the directory of the training run
     epoch: int  # epochs completed when it was written
     # how the observations that it was trained on were made; None where there were none
-    recipe: ObservationRecipe | None
+    recipe: ObservationRecipe | RgbRecipe | None
     state: dict[str, Tensor]  # the module's state dict
     file_hash: str  # first 16 hex digits of the file's SHA-256
 
@@ -136,14 +137,13 @@ def read_checkpoint(path: str | Path, name: str = "ckpt_path", stage: str = "det
             f"{name}: '{path}' was written by {age} version of this library (checkpoint version "
             f"{provenance['version']}, this one reads {CHECKPOINT_VERSION}); {fix}"
         )
-    recipe = provenance.get("observation")
     try:
         checkpoint = Checkpoint(
             path=path,
             config=with_moved_targets(provenance["config"]),
             **{key: provenance[key] for key in ("body_hash", "data_licence", "run")},
             epoch=content["epoch"] + 1,
-            recipe=None if recipe is None else ObservationRecipe(**recipe),
+            recipe=_read_recipe(provenance.get("observation")),
             state=dict(content["state_dict"]),
             file_hash=hashlib.sha256(data).hexdigest()[:16],
         )
@@ -154,6 +154,27 @@ def read_checkpoint(path: str | Path, name: str = "ckpt_path", stage: str = "det
             f"{name}: '{path}': {reason(error, 1000)}; use another checkpoint of the run"
         ) from error
     return checkpoint
+
+
+def _plain_recipe(recipe: ObservationRecipe | RgbRecipe) -> dict[str, Any]:
+    """A recipe as plain values. One of depth images, the only kind once, does not name its class."""
+    named = {} if isinstance(recipe, ObservationRecipe) else {"_target_": _path_of(type(recipe))}
+    return {**named, **asdict(recipe)}
+
+
+def _read_recipe(plain: Any) -> ObservationRecipe | RgbRecipe | None:
+    if plain is None:
+        return None
+    fields = dict(plain)
+    target = fields.pop("_target_", _path_of(ObservationRecipe))
+    known = {_path_of(kind): kind for kind in (ObservationRecipe, RgbRecipe)}
+    if target not in known:
+        raise ValueError(f"observation: expected one of {', '.join(known)}, got {shown(target)}")
+    return known[target](**fields)
+
+
+def _path_of(kind: type) -> str:
+    return f"{kind.__module__}.{kind.__qualname__}"
 
 
 def _content(path: Path, data: bytes, name: str, stage: str) -> Any:

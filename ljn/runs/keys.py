@@ -79,6 +79,7 @@ KEYS: dict[str, Key] = {
         _MODEL,
         "_target_ _convert_ net optimizer scheduler genders predicted loss loss_vertices joint_weight",
     ),
+    **_rows("module", _MODEL, "target_sigmas hard_keypoints backbone_weights"),
     **_rows("module", Key.THROUGH | Key.ONE_STAGE, "body_path"),
     "data": _DATA,
     **_rows(
@@ -89,10 +90,12 @@ KEYS: dict[str, Key] = {
     **_rows(
         "data.synthesis", _DATA, "keypoint_noise_px missing_keypoints focal_factors pixel_factors renderer"
     ),
+    **_rows("data", _DATA, "recipe background photo"),
+    **_rows("data.synthesis", _DATA, "scale shift rotation_deg mirrored"),
     **_rows("data.synthesis", _DATA | Key.ONE_STAGE, "initial_joints joint_noise_m joint_noise"),
     **_rows("data.observation", _DATA, "_target_ _convert_ num_points normals crop_px"),
     **_rows("data", Key.THROUGH | Key.CHANGEABLE | Key.ONE_STAGE, "detector_ckpt"),
-    **_rows("data", Key.THROUGH | Key.CHANGEABLE, "source body_path"),
+    **_rows("data", Key.THROUGH | Key.CHANGEABLE, "source body_path keypoint_ckpt"),
     **_rows("data", Key.MACHINE | Key.CHANGEABLE, "cache_dir num_workers prefetch_batches"),
     "trainer": _DATA,
     **_rows("trainer", _DATA, "_target_ _convert_ max_epochs precision gradient_clip_val deterministic"),

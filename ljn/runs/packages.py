@@ -1,4 +1,5 @@
-"""Packages: trained weights as one file to ship, a joint detector's and, if there is one, a mesh regressor's.
+"""Packages: trained weights as one file to ship: a joint detector's and, if there is one, a mesh regressor's; or a
+keypoint detector's.
 
 A package is a safetensors file, which can hold nothing but numbers and text: the tensor `STAGE.NAME` is an entry of
 that stage's state, half precision or int8 with a scale for each output row, and one text, JSON, says the rest: the
@@ -26,7 +27,7 @@ from ljn.runs.files import write_atomically, write_json
 
 PACKAGE_VERSION = 1
 SUFFIX = ".safetensors"
-STAGES = ("detector", "mesh")
+STAGES = ("detector", "mesh", "keypoints")
 SHIPPED = Path(__file__).parents[1] / "weights"
 """The folder of the packages that come with the library."""
 DEFAULT = "small"

@@ -8,15 +8,18 @@ from pathlib import Path
 from hydra.core.override_parser.types import Quote, QuotedString
 
 _SHORT = {
-    **dict.fromkeys(("input", "camera", "keypoints", "mask"), ("task=predict",)),
+    **dict.fromkeys(("input", "camera", "keypoints", "mask", "rgb"), ("task=predict",)),
+    "keypoint_detector": ("task=predict", "task=package", "task=benchmark"),
     "mesh_ckpt_path": ("task=predict", "task=demo", "task=package", "task=benchmark"),
 }
 """Keys of tasks that may be typed without their `task.`, and the tasks that they are of."""
 _PATHS = (
     *(f"task.{name}" for name in (*_SHORT, "directory")),
-    *("ckpt_path", "weights", "paths.output_dir", "paths.cache_dir", "body.path", "data.source.path"),
-    *("data.source.split_path", "data.detector_ckpt", "bench.path", "bench.samples.path"),
+    *("ckpt_path", "weights", "paths.output_dir", "paths.cache_dir", "body.path"),
+    *("data.detector_ckpt", "data.keypoint_ckpt", "bench.path", "bench.samples.path"),
 )
+_OF_SOURCE = re.compile(r"data\.source\.(sources\.\w+\.)?(path|split_path|splits|skeleton)")
+"""The paths of sources, also of those that are mixed."""
 # What is no bare path: nothing, quoted, a list, an interpolation, or several values of a sweep.
 _NOT_BARE = re.compile(r"""$|null$|['"\[]|.*\$\{|.*,|(choice|glob|tag)\(""")
 
@@ -44,7 +47,8 @@ def _prepare(argument: str, arguments: Sequence[str]) -> str:
         key = f"task.{key}"
         argument = f"{key}={value}"
     path = os.path.expanduser(value)
-    if key not in _PATHS or (_NOT_BARE.match(value) and not os.path.exists(path)):
+    is_path = key in _PATHS or _OF_SOURCE.fullmatch(key)
+    if not is_path or (_NOT_BARE.match(value) and not os.path.exists(path)):
         return argument
     return f"{key}={quoted(path)}"
 

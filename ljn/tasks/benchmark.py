@@ -121,7 +121,11 @@ def _own(cfg: DictConfig) -> dict[str, Any]:
     if not given and not task.predictors and DEFAULT in shipped():
         given.append({"weights": DEFAULT})
     use_gpu = cfg.trainer.accelerator != "cpu" and torch.cuda.is_available()
-    shared = {"device": "cuda" if use_gpu else "cpu", "body_path": cfg.body.path}
+    shared = {
+        "device": "cuda" if use_gpu else "cpu",
+        "body_path": cfg.body.path,
+        "keypoint_detector": task.keypoint_detector,
+    }
     configs = {}
     for number, each in enumerate(given):
         refine = cfg.refine if "mesh_ckpt_path" not in each or each["mesh_ckpt_path"] else None

@@ -14,7 +14,8 @@ from ljn.metrics import apve, mpjpe
 from ljn.pipeline.frames import FrameFiles, FrameImages
 from ljn.pipeline.overview import Panel, draw_overview, write_turntable
 from ljn.pipeline.pictures import draw_prediction
-from ljn.pipeline.pipeline import Pipeline, Prediction
+from ljn.pipeline.pipeline import Pipeline
+from ljn.pipeline.prediction import Prediction
 from ljn.pipeline.samples import SampleFiles, Truth, find_samples, read_truth
 from ljn.pipeline.writing import write_arrays, write_mesh
 from ljn.runs import layout

@@ -50,6 +50,10 @@ def export(cfg: DictConfig) -> dict[str, float]:
     datamodule.takes = ("confidences",)
     datamodule.prepare_data()
     batch, depth = datamodule.examples(cfg.task.split, list(cfg.task.indices))
+    if "keypoints" not in batch:
+        raise ValueError(
+            "data: task=export writes depth images and keypoints, got colour crops; use data=synthetic"
+        )
     if len(cameras := batch["camera"].unique(dim=0)) > 1:
         raise ValueError(
             "data.synthesis: expected one camera for all samples of a folder, got several; add "

@@ -17,8 +17,8 @@ _OF_BODY = {
     "body.predicted": ("module.predicted",),
 }
 _MISSING = object()
-_WHOLE = {"data/sensor=": ("data.sensor",), "data/source=": ("data.source", "data.synthesis.heading")}
-"""Groups that an evaluation may choose as a whole, and the keys that they set."""
+_WHOLE = {"data/sensor=": "data.sensor", "data/source=": "data.source"}
+"""Groups that an evaluation may choose as a whole, and the key that each sets."""
 
 
 def typed_overrides() -> list[str]:
@@ -40,11 +40,9 @@ def with_checkpoint_config(cfg: DictConfig, checkpoint: Checkpoint, overrides: l
     plain |= {name: _with_call(checkpoint.config[name], plain[name], name) for name in CONFIG_GROUPS}
     merged = OmegaConf.create(plain)
     OmegaConf.set_struct(merged, True)
-    for start, keys in _WHOLE.items():
+    for start, key in _WHOLE.items():
         if any(line.startswith(start) for line in overrides):
-            for key in keys:
-                chosen = OmegaConf.select(cfg, key)
-                OmegaConf.update(merged, key, chosen, merge=False, force_add=True)
+            OmegaConf.update(merged, key, OmegaConf.select(cfg, key), merge=False, force_add=True)
     apply_overrides(merged, [line for line in overrides if not line.startswith(tuple(_WHOLE))])
     return merged
 
@@ -92,7 +90,8 @@ def _set(cfg: DictConfig, key: str, value: Any, line: str) -> None:
         known = ", ".join(sorted(str(name) for name in parent)) if isinstance(parent, DictConfig) else "none"
         raise ValueError(f"{line}: the checkpoint's config has no key '{key}'; known there: {known}")
     OmegaConf.update(cfg, key, value)
-    for derived in _OF_BODY.get(key, ()):
+    mixed = OmegaConf.select(cfg, "data.source.sources", default={}) if key == "body.genders" else {}
+    for derived in (*_OF_BODY.get(key, ()), *(f"data.source.sources.{name}.genders" for name in mixed)):
         if OmegaConf.select(cfg, derived, default=_MISSING) is not _MISSING:
             OmegaConf.update(cfg, derived, value)
 

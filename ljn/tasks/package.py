@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from omegaconf import DictConfig, OmegaConf
 
+from ljn.pipeline.keypoint_finder import KeypointFinder
 from ljn.pipeline.pipeline import Pipeline
 from ljn.runs import layout
 from ljn.runs.checkpoints import Checkpoint, for_package, read_checkpoint
@@ -27,7 +28,8 @@ _OF_RECORD = (
 
 
 def package(cfg: DictConfig) -> dict[str, float]:
-    """Write a package of a joint detector and, if there is one, a mesh regressor, and its line of the folder's index.
+    """Write a package and its line of the folder's index: of a joint detector and, if there is one, a mesh regressor;
+    or of a keypoint detector.
 
     Nothing in it names a place on this machine: paths in the configurations become null.
 
@@ -43,7 +45,13 @@ def package(cfg: DictConfig) -> dict[str, float]:
         ValueError: A key is missing, or a checkpoint is wrong; see `Pipeline.load`.
     """
     task = cfg.task
-    for key in ("ckpt_path", "task.name", "task.licence"):
+    of_keypoints = task.keypoint_detector is not None
+    if of_keypoints and (cfg.ckpt_path is not None or task.mesh_ckpt_path is not None):
+        raise ValueError(
+            "keypoint_detector, ckpt_path: a package holds a keypoint detector or the two other stages, got both; "
+            "write two"
+        )
+    for key in ("task.keypoint_detector" if of_keypoints else "ckpt_path", "task.name", "task.licence"):
         if not isinstance(value := OmegaConf.select(cfg, key), str) or not value:
             raise ValueError(f"{key}: expected text, got {value!r}; {_COMMAND}")
     if not NAME.fullmatch(task.name):
@@ -56,14 +64,19 @@ def package(cfg: DictConfig) -> dict[str, float]:
         )
     directory = Path(task.directory or Path(cfg.paths.output_dir) / "packages")
     check_writable(directory, "task.directory")
-    # The two fit each other and the body.
-    Pipeline.load(cfg.ckpt_path, task.mesh_ckpt_path, body_path=cfg.body.path)
-    checkpoints = {"detector": read_checkpoint(cfg.ckpt_path)}
-    if task.mesh_ckpt_path is not None:
-        checkpoints["mesh"] = read_checkpoint(task.mesh_ckpt_path, "task.mesh_ckpt_path", "mesh")
+    if of_keypoints:
+        KeypointFinder.load(task.keypoint_detector, name="task.keypoint_detector")
+        checkpoints = {"keypoints": read_checkpoint(task.keypoint_detector, "task.keypoint_detector")}
+    else:
+        # The two fit each other and the body.
+        Pipeline.load(cfg.ckpt_path, task.mesh_ckpt_path, body_path=cfg.body.path)
+        checkpoints = {"detector": read_checkpoint(cfg.ckpt_path)}
+        if task.mesh_ckpt_path is not None:
+            checkpoints["mesh"] = read_checkpoint(task.mesh_ckpt_path, "task.mesh_ckpt_path", "mesh")
     path = directory / f"{task.name}{SUFFIX}"
     trainings = {name: _training(each) for name, each in checkpoints.items()}
-    _check_trained_on(checkpoints["detector"], trainings.get("mesh", {}).get("detector"))
+    if "mesh" in checkpoints:
+        _check_trained_on(checkpoints["detector"], trainings["mesh"].get("detector"))
     stages = {name: for_package(each, _config(each), trainings[name]) for name, each in checkpoints.items()}
     states = {name: each.state for name, each in checkpoints.items()}
     write_package(path, task.name, task.licence, stages, states, task.precision)

@@ -2,6 +2,7 @@
 
 import hashlib
 import logging
+import math
 import os
 import sys
 from dataclasses import asdict
@@ -16,10 +17,12 @@ from tqdm import tqdm
 from ljn.body.skeleton import JOINT_NAMES
 from ljn.geometry.camera import Camera
 from ljn.geometry.distance import distances_to_mesh
-from ljn.pipeline.frames import FrameFiles, find_frames, predict_frames
+from ljn.pipeline.frames import FrameFiles, find_frames, in_order, predict_frames
 from ljn.pipeline.inputs import read_camera
+from ljn.pipeline.motion import WRITERS, PosedFrame, body_motion, shape_distance_mm
 from ljn.pipeline.pictures import draw_prediction
-from ljn.pipeline.pipeline import Pipeline, Prediction
+from ljn.pipeline.pipeline import Pipeline
+from ljn.pipeline.prediction import Prediction
 from ljn.pipeline.report import Report
 from ljn.pipeline.writing import write_arrays, write_mesh
 from ljn.refinement import chosen_settings
@@ -30,10 +33,11 @@ from ljn.tasks.validation import check_writable
 
 _LOG = logging.getLogger(__name__)
 _SUMMARY = "predictions.json"
-_WRITTEN = (".npz", ".ply", ".glb", ".png")
+_SEQUENCE = "sequence"
+_WRITTEN = (".npz", ".ply", ".glb", ".png", *(suffix for suffix, _ in WRITERS.values()))
 _NEEDED = ("task.input", "task.camera")
 _CHECKPOINTS = ("ckpt_path", "task.mesh_ckpt_path")
-_OPTIONAL = ("task.keypoints", "task.mask")
+_OPTIONAL = ("task.keypoints", "task.mask", "task.rgb", "task.keypoint_detector")
 _COMMAND = (
     "python run.py task=predict task.input=DEPTH.png task.camera=CAMERA.yaml task.keypoints=KEYPOINTS.json "
     "ckpt_path=DETECTOR.ckpt task.mesh_ckpt_path=MESH.ckpt"
@@ -45,7 +49,8 @@ def predict(cfg: DictConfig) -> dict[str, float]:
 
     The hash is that of the input's absolute path, so that `alice/depth` and `bob/depth` have folders of their own; what
     an earlier call on the same input left there is removed. A frame of a folder that cannot be predicted is reported,
-    and all others are predicted. `predictions.json` lists each frame's outcome.
+    and all others are predicted. `predictions.json` lists each frame's outcome. With `task.sequence`, the frames are
+    one motion, too, in files named `sequence`; a frame that failed stays as the one before.
 
     Args:
         cfg: The composed configuration; of it `task`, `ckpt_path`, `weights`, `refine`, `body.path`, `paths`,
@@ -71,7 +76,14 @@ def predict(cfg: DictConfig) -> dict[str, float]:
             got = "null" if value is None else f"{value!r}, no text: write '{key}=\"PATH\"'"
             raise ValueError(f"{key}: expected a path, got {got}; {_COMMAND}")
     camera = read_camera(task.camera)
-    frames = find_frames(task.input, task.keypoints, task.mask, task.mask_id)
+    frames = find_frames(task.input, task.keypoints, task.mask, task.mask_id, task.rgb)
+    forms = _sequence_forms(task)
+    if forms:
+        frames.sort(key=lambda frame: in_order(frame.name))
+        if any(frame.name == _SEQUENCE for frame in frames):
+            raise ValueError(
+                f"task.sequence: a frame is named '{_SEQUENCE}', as the motion's file will be; rename it"
+            )
     directory = _directory(cfg.paths.output_dir, task.input)
     check_writable(directory)
     if cfg.num_threads is not None:
@@ -79,18 +91,30 @@ def predict(cfg: DictConfig) -> dict[str, float]:
     use_gpu = cfg.trainer.accelerator != "cpu" and torch.cuda.is_available()
     device = "cuda" if use_gpu else "cpu"
     if package:
-        pipeline = Pipeline.from_pretrained(package, device, cfg.body.path, cfg.refine, task.strict)
+        pipeline = Pipeline.from_pretrained(
+            package, device, cfg.body.path, cfg.refine, task.strict, task.keypoint_detector
+        )
     else:
         pipeline = Pipeline.load(
-            cfg.ckpt_path, task.mesh_ckpt_path, device, cfg.body.path, cfg.refine, task.strict
+            *(cfg.ckpt_path, task.mesh_ckpt_path, device, cfg.body.path, cfg.refine, task.strict),
+            task.keypoint_detector,
         )
     if task.keypoints is None and pipeline.needs_keypoints:
         raise ValueError(
             f"task.keypoints: expected a path, since the detector '{package or cfg.ckpt_path}' takes keypoints, got "
             f"null; {_COMMAND}, or a detector that can do without: experiment=detector/cascade"
         )
+    if forms and pipeline.regressor is None:
+        raise ValueError(
+            "task.sequence: a motion is of meshes, and there is no mesh regressor; give task.mesh_ckpt_path=MESH.ckpt"
+        )
+    if task.keypoints is None and task.rgb is None and pipeline.finder and pipeline.finder.sees == "rgb":
+        raise ValueError(
+            f"task.rgb: expected a path, since the keypoint detector '{task.keypoint_detector}' finds keypoints in the "
+            "colour image, got null; add rgb=IMAGE.png, registered to the depth image"
+        )
 
-    results = _predict(pipeline, frames, camera, directory, may_fail=Path(task.input).is_dir())
+    results, posed = _predict(pipeline, frames, camera, directory, may_fail=Path(task.input).is_dir())
     failed = [name for name, result in results.items() if "error" in result]
     name = "median_distance_mm"
     metrics = {"predict/frames": float(len(results) - len(failed))}
@@ -102,10 +126,22 @@ def predict(cfg: DictConfig) -> dict[str, float]:
         "predict/doubtful": sum(bool(result.get("warnings")) for result in results.values()),
         "detector": pipeline.detector.origin,
         "regressor": pipeline.regressor.origin if pipeline.regressor else None,
+        "keypoint_detector": pipeline.finder.stage.origin if pipeline.finder else None,
         "refine": chosen_settings(cfg.refine),
         "camera": asdict(camera),
         "frames": results,
     }
+    if forms and pipeline.regressor is not None and any(frame is not None for frame in posed):
+        motion = body_motion(posed, pipeline.regressor.module.body, task.rate_hz)
+        for form in forms:
+            suffix, write = WRITERS[form]
+            write(directory / f"{_SEQUENCE}{suffix}", motion)
+        summary[_SEQUENCE] = {
+            "rate_hz": task.rate_hz,
+            "frames": len(posed),
+            "betas": motion.betas.tolist(),
+            "shape_distance_mm": shape_distance_mm(posed, motion),
+        }
     write_json(directory / _SUMMARY, summary)
     _LOG.info("%d of %d frames predicted: %s", len(results) - len(failed), len(results), directory)
     if failed:
@@ -114,6 +150,21 @@ def predict(cfg: DictConfig) -> dict[str, float]:
             f"{failed[0]}: {results[failed[0]]['error']} (all of them are in {directory / _SUMMARY})"
         )
     return metrics
+
+
+def _sequence_forms(task: Any) -> list[str]:
+    """The forms of the sequence's files; raises a `ValueError` where what is asked for makes no sense."""
+    given = OmegaConf.to_container(task)["sequence"]  # type: ignore[index, call-overload]
+    forms = [given] if isinstance(given, str) else given or []
+    if unknown := [form for form in forms if form not in WRITERS]:
+        raise ValueError(f"task.sequence: expected some of {', '.join(WRITERS)}, got {unknown[0]!r}")
+    if forms and not Path(task.input).is_dir():
+        raise ValueError(
+            f"task.sequence: expected a folder of frames as task.input, got the file '{task.input}'"
+        )
+    if not (isinstance(task.rate_hz, int | float) and 0 < task.rate_hz < math.inf):
+        raise ValueError(f"task.rate_hz: expected frames a second, more than 0, got {task.rate_hz!r}")
+    return forms
 
 
 def _directory(output_dir: str, input: str) -> Path:
@@ -126,15 +177,20 @@ def _directory(output_dir: str, input: str) -> Path:
 
 def _predict(
     pipeline: Pipeline, frames: list[FrameFiles], camera: Camera, directory: Path, may_fail: bool
-) -> dict[str, dict[str, Any]]:
-    """Predict and write; returns what became of each frame."""
+) -> tuple[dict[str, dict[str, Any]], list[PosedFrame | None]]:
+    """Predict and write; returns what became of each frame, and its pose, None where there is none."""
     for path in directory.glob("*"):
         if path.suffix in _WRITTEN or path.name == _SUMMARY:
             path.unlink()  # of an earlier call; it would pass for this one's
     results: dict[str, dict[str, Any]] = {}
+    posed: list[PosedFrame | None] = []
     with tqdm(total=len(frames), unit="frame", disable=None if may_fail else True) as progress:
         for frame, prediction, depth, error in predict_frames(pipeline, frames, camera, FrameFiles.read):
             results[frame.name] = {"input": str(frame.depth)}
+            if prediction is None or prediction.pose is None:
+                posed.append(None)
+            else:
+                posed.append(PosedFrame.of(prediction))
             if prediction is not None and depth is not None:
                 results[frame.name] |= _write(directory / frame.name, prediction, depth, camera)
             elif error is not None:
@@ -143,7 +199,7 @@ def _predict(
                 results[frame.name]["error"] = str(error)
                 progress.write(f"{frame.name} failed: {error}", file=sys.stderr)
             progress.update()
-    return results
+    return results, posed
 
 
 def _write(path: Path, prediction: Prediction, depth: np.ndarray, camera: Camera) -> dict[str, Any]:

@@ -19,9 +19,9 @@ from torch.utils.data import DataLoader
 
 from datamodules.batches import BLOCK, RepeatedBatches
 from datamodules.noise import add_depth_noise
+from datamodules.rendered import SynthesizedSamples
 from datamodules.sources.embedded import EmbeddedSource
 from datamodules.synthesis import DepthSynthesizer, SynthesisSettings
-from datamodules.synthetic import SynthesizedSamples
 from ljn.body import SMPL, SMPLOutput, SparseSMPL, load_body_models
 from ljn.cloud.normals import get_normal_estimator
 from ljn.cloud.observation import ObservationRecipe

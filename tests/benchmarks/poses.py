@@ -26,8 +26,8 @@ from datamodules.sources import SPLITS, PoseRecords
 from datamodules.sources.embedded import EmbeddedSource
 from datamodules.sources.embedded.joint_limits import ARM_AXES, RANGES, Ranges, within_limits
 from datamodules.sources.embedded.mixture import PoseMixture
-from datamodules.sources.embedded.penetration import penetration
-from datamodules.sources.embedded.reference import REFERENCE_CAPSULES, REFERENCE_OFFSETS
+from datamodules.sources.penetration import penetration
+from datamodules.sources.reference import REFERENCE_CAPSULES, REFERENCE_OFFSETS
 from ljn.body import SMPL, load_body_models
 from ljn.body.kinematics import SIDES, joint_positions, mirror, world_rotations
 from ljn.body.skeleton import JOINT_INDEX, NUM_JOINTS, ROOT

@@ -20,7 +20,7 @@ from ljn.geometry.camera import place_at_root, project
 from ljn.geometry.distance import distances_to_mesh
 from ljn.pipeline.keypoint_orders import ORDERS
 from ljn.pipeline.pictures import draw_prediction
-from ljn.pipeline.pipeline import Prediction
+from ljn.pipeline.prediction import Prediction
 
 # Where COCO's keypoints are among MHR's 70: nose, eyes, ears, shoulders, elbows, wrists, hips, knees, ankles.
 COCO_OF_MHR = (0, 1, 2, 3, 4, 5, 6, 7, 8, 62, 41, 9, 10, 11, 12, 13, 14)

@@ -83,7 +83,7 @@ def test_a_batch_keeps_its_contract(batch):
         "joints": (12, 24, 3), "pose": (12, 72), "betas": (12, 10), "gender": (12,), "camera": (12, 4),
         "sample_id": (12,),
     }  # fmt: skip
-    others = {"crop", "crop_camera", "confidences", "lifted_joints"}
+    others = {"crop", "crop_camera", "rgb", "rgb_camera", "confidences", "lifted_joints"}
     assert set(batch) == set(Batch.__annotations__) - others == set(shapes)
     for name, shape in shapes.items():
         assert batch[name].shape == shape, name

@@ -4,6 +4,7 @@ import math
 import multiprocessing
 import os
 import resource
+import types
 from dataclasses import fields, replace
 
 import numpy as np
@@ -19,9 +20,13 @@ from datamodules.sources.embedded.source import FAMILY_SHARES
 from datamodules.synthesis import SynthesisSettings, concatenate
 from ljn.body import SMPL
 from ljn.body.skeleton import ROOT
+from ljn.cloud.lifting import lift_keypoints
 from ljn.cloud.observation import ObservationRecipe
-from ljn.geometry.camera import project
+from ljn.geometry.camera import project, transfer
 from ljn.geometry.rotations import CAMERA_FROM_BODY, rotvec_to_rotmat
+from ljn.modules.keypoint_detector import KeypointDetector
+from ljn.nets.cpn import CascadedPyramidNetwork
+from ljn.nets.resnet import ResNet
 
 
 @pytest.fixture(scope="module")
@@ -87,7 +92,7 @@ def test_a_smaller_validation_set_shares_its_draws_with_a_larger_one(make_datamo
 def test_a_fixed_set_is_rendered_once_and_shared_by_data_modules_that_want_the_same(
     make_datamodule, tmp_path, caplog
 ):
-    with caplog.at_level(logging.INFO, "datamodules.synthetic"):
+    with caplog.at_level(logging.INFO, "datamodules"):
         first = val_set(make_datamodule(num_val=4, cache_dir=tmp_path))
         assert "rendering 4 val samples" in caplog.text
         caplog.clear()
@@ -100,7 +105,7 @@ def test_poses_are_made_once_and_shared_by_data_modules_that_want_the_same(make_
         caplog.clear()
         return make_datamodule(num_train=4, cache_dir=tmp_path, **changes).describe(("train",))["pool"]
 
-    with caplog.at_level(logging.INFO, "datamodules.synthetic"):
+    with caplog.at_level(logging.INFO, "datamodules"):
         first = hashes()
         assert "making 4 train poses" in caplog.text
         assert hashes(seed=1, num_val=1, reuse=2) == first
@@ -404,3 +409,31 @@ def test_kinds_of_poses_and_headings_are_those_of_the_samples(make_datamodule):
     facing = (groups["heading"][upright] == "facing").mean()
     assert 0.42 < facing < 0.72
     assert 0.1 < (groups["heading"][upright] == "away").mean() < 0.3
+
+
+def test_a_keypoint_detector_s_keypoints_stand_in_place_of_the_noisy_ones(
+    make_datamodule, tmp_path, monkeypatch
+):
+    torch.manual_seed(0)
+    backbone = ResNet(2, "basic", (1, 1, 1, 1), (8, 8, 8, 8), 8, 3)
+    module = KeypointDetector(CascadedPyramidNetwork(backbone, "depth", 8, 4)).eval()
+    checkpoint = types.SimpleNamespace(file_hash="abc", path=tmp_path / "x.ckpt", recipe=ObservationRecipe())
+    monkeypatch.setattr("datamodules.synthetic.load_module", lambda *_: (module, checkpoint))
+    takes = ("crop", "crop_camera", "initial_joints", "confidences")
+    noisy, found = make_datamodule(), make_datamodule(keypoint_ckpt=tmp_path / "x.ckpt")
+    noisy.takes = found.takes = takes
+    found.prepare_data()
+    assert found.fingerprint != noisy.fingerprint
+    assert found.describe(["test"])["keypoint_detector"]["hash"] == "abc"
+    (before, _), (after, depth) = (data.examples("test", range(3)) for data in (noisy, found))
+    torch.testing.assert_close(after["joints"], before["joints"])
+    in_image = transfer(module(before).keypoints, before["crop_camera"], before["camera"])
+    torch.testing.assert_close(after["keypoints"], in_image)
+    # Lifted in the crop, a pixel of which is some two of the image, as they are in the image.
+    lifted = np.stack([lift_keypoints(*each, found.camera) for each in zip(in_image.numpy(), depth.numpy())])
+    assert np.median(np.abs(after["initial_joints"].numpy() - lifted)) < 0.01
+    assert ((after["confidences"] == 0) | (after["confidences"] >= 0.2)).all()
+    with pytest.raises(
+        ValueError, match=r"sees crops of 128 px, those of the data have 64; set data.observation.crop"
+    ):
+        make_datamodule(keypoint_ckpt=tmp_path / "x.ckpt", crop_px=64).prepare_data()

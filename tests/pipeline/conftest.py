@@ -11,7 +11,8 @@ from ljn.modules.mesh_regressor import MeshRegressor
 from ljn.nets.body_network import DirectBodyNetwork
 from ljn.nets.joint_network import LocalJointNetwork
 from ljn.nets.pointnet import PointNet
-from ljn.pipeline.pipeline import Pipeline, Stage
+from ljn.pipeline.pipeline import Pipeline
+from ljn.pipeline.stages import Stage
 
 NUM_POINTS = 128
 

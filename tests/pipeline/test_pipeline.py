@@ -224,7 +224,7 @@ def test_an_error_in_a_batch_names_the_image(pipeline, given, kinect):
     depth, keypoints = given
     with pytest.raises(ValueError, match="image 1 of the batch: depth: all pixels are 0"):
         pipeline(np.stack([depth, 0 * depth]), kinect, [keypoints, keypoints])
-    with pytest.raises(ValueError, match=re.escape("got 2 images, 1 keypoints and 2 masks")):
+    with pytest.raises(ValueError, match=re.escape("got 2 images, 1 keypoints, 2 masks and 2 colour images")):
         pipeline(np.stack([depth, depth]), kinect, [keypoints])
 
 

@@ -1,4 +1,3 @@
-import re
 import shutil
 from collections.abc import Mapping
 from dataclasses import fields
@@ -31,8 +30,7 @@ def keys_of(conf):
         group = ".".join(path.parent.relative_to(conf).parts)
         content = OmegaConf.to_container(OmegaConf.load(path), resolve=False)
         content.pop("defaults", None)
-        header = re.search(r"^# @package (\S+)$", path.read_text(), re.MULTILINE)
-        package = header[1].replace("_global_", "") if header else group
+        package = "" if "@package _global_" in path.read_text() else group
         keys |= {group, *(key for key, _ in leaves(content, package))}
     return keys - {""}
 

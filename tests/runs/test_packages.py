@@ -12,9 +12,11 @@ from safetensors.torch import save
 import ljn.building
 from ljn import Pipeline
 from ljn.building import build
+from ljn.cloud.observation import ObservationRecipe
+from ljn.cloud.rgb import RgbRecipe
 from ljn.modules.joint_detector import JointDetector
 from ljn.runs import packages
-from ljn.runs.checkpoints import CHECKPOINT_VERSION, load_module, read_checkpoint
+from ljn.runs.checkpoints import CHECKPOINT_VERSION, Provenance, load_module, read_checkpoint
 from ljn.runs.packages import PRECISIONS, SHIPPED, find_package, stages_of, write_package
 
 INDEX = json.loads((SHIPPED / "index.json").read_text())
@@ -90,6 +92,13 @@ def test_a_package_is_read_as_the_checkpoint_that_it_was_made_of(package):
             assert torch.equal(stored, value)
 
 
+@pytest.mark.parametrize("recipe", [ObservationRecipe(64, spacing_m=0.01), RgbRecipe(64, 32), None])
+def test_the_recipe_of_a_checkpoint_comes_back(recipe, package):
+    content = Provenance({}, "", "", "", recipe).content["observation"]
+    read = read_checkpoint(with_text(package, set_stage(observation=content)))
+    assert read.recipe == recipe
+
+
 def test_equal_weights_are_equal_files_whatever_was_there(package, tmp_path):
     before = package.read_bytes()
     write_package(package, "tiny", "CC0-1.0", about(), state())
@@ -152,6 +161,8 @@ def set_config(group, **values):
         (set_stage(epoch="3"), "no whole configuration"),
         (set_stage(config=[]), "no whole configuration"),
         (set_stage(observation={"num_points": 3, "x": 1}), "unexpected keyword"),
+        (set_stage(observation={"_target_": "os.system"}), r"expected one of ljn\..*, got 'os\.system'"),
+        (set_stage(observation={"_target_": "ljn.cloud.rgb.RgbRecipe", "width_px": 3}), "width_px: expected"),
         (set_config("module", _target_="os.system"), r"os\.system"),
         (set_config("module", net={"_target_": "subprocess.Popen"}), r"subprocess\.Popen"),
         (set_config("preset", name="${oc.env:HOME}"), "no whole configuration"),

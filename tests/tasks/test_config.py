@@ -42,8 +42,12 @@ def test_every_config_composes_validates_and_builds(choice, compose_config, tmp_
         for name in ("body_network", "body_network_on_pointnet", "direct_body_network", "kinematic")
     ]
     partners |= dict.fromkeys(of_bodies, "module=mesh_regressor")
+    partners |= {"model=cpn": "module=keypoint_detector", "module=keypoint_detector": "model=cpn"}
+    partners |= {f"data/photo={name}": "data=rgb" for name in ("plain", "realistic")}
     if choice in partners:
         overrides.append(partners[choice])
+    if "model=cpn" in overrides:
+        overrides.append("optimized_metric=val/keypoint_error_px")
     cfg = compose_config(*overrides, return_hydra_config=True)
     with open_dict(cfg):
         del cfg["hydra"]

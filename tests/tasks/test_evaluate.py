@@ -93,6 +93,20 @@ def test_a_sensor_is_chosen_as_a_whole_and_then_changed(trained, smoke_config, t
     assert with_checkpoint_config(cfg, checkpoint, ["data/sensor=gaussian"]).data.sensor is None
 
 
+def test_a_source_is_chosen_as_a_whole_and_has_the_checkpoints_bodies(trained, smoke_config, tmp_path):
+    checkpoint = read_checkpoint(trained[1] / "checkpoints" / "best.ckpt")
+    checkpoint.config["body"]["genders"] = ["male"]
+    typed = ["data/source=npz", "data.source.path=poses.npz", "data.source.stride=3"]
+    merged = with_checkpoint_config(evaluation(smoke_config, trained, tmp_path, *typed), checkpoint, typed)
+    assert merged.data.source._target_ == "datamodules.sources.npz.NpzSource"
+    assert (merged.data.source.path, merged.data.source.stride) == ("poses.npz", 3)
+    assert merged.data.source.genders == ["male"]
+    typed = ["data/source=mixed", "data.source.weights.npz=2", "body.genders=[neutral]"]
+    merged = with_checkpoint_config(evaluation(smoke_config, trained, tmp_path, *typed), checkpoint, typed)
+    assert merged.data.source.weights == {"embedded": 1, "amass": 0, "bvh": 0, "npz": 2}
+    assert all(source.genders == ["neutral"] for source in merged.data.source.sources.values())
+
+
 def test_an_evaluation_has_this_machines_values_and_the_checkpoints_keys(
     write_checkpoint, smoke_config, tmp_path
 ):

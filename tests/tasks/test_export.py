@@ -98,6 +98,10 @@ def test_keypoints_that_are_missing_have_no_confidence(smoke_config, tmp_path):
         ("task.indices=[16]", r"the test set has 16 samples, got \[16\]"),
         ("task.names=[a]", r"task\.names: expected 4 different names, got \['a'\]"),
         ("data.synthesis.focal_factors=[1,2]", "expected one camera for all samples"),
+        (
+            "data=rgb",
+            "data: task=export writes depth images and keypoints, got colour crops; use data=synthetic",
+        ),
     ],
 )
 def test_what_cannot_be_exported_is_named(change, message, smoke_config, tmp_path):

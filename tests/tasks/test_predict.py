@@ -9,9 +9,11 @@ import torch
 from PIL import Image
 
 import ljn.tasks.predict
+from datamodules.sources.bvh import BvhSource
 from ljn import SMPL, Pipeline
 from ljn.body.skeleton import JOINT_INDEX, ROOT
 from ljn.geometry.camera import project
+from ljn.pipeline.frames import in_order
 from ljn.pipeline.keypoint_orders import ORDERS
 from ljn.render import get_renderer
 from ljn.tasks.predict import predict
@@ -123,6 +125,48 @@ def test_a_damaged_frame_of_a_folder_is_reported_and_costs_the_others_nothing(fo
     # The same image twice, in one batch: apart from rounding, the same result.
     distances = [summary["frames"][name]["median_distance_mm"] for name in "ac"]
     assert distances[0] == pytest.approx(distances[1], rel=1e-4)
+
+
+def test_a_folder_is_a_motion_too(folders, config, tmp_path):
+    changes, outputs = folders
+    with pytest.raises(ValueError, match="1 of 3 frames failed"):
+        predict(config(*changes, "task.sequence=[amass,bvh]", "task.rate_hz=5"))
+    about = json.loads((outputs / "predictions.json").read_text())["sequence"]
+    assert (about["frames"], about["rate_hz"]) == (3, 5)
+    assert 0 <= about["shape_distance_mm"] < 100
+    with np.load(outputs / "sequence.npz") as arrays, np.load(outputs / "a.npz") as first:
+        np.testing.assert_allclose(arrays["poses"][1, :66], first["pose"][:66], atol=1e-5)
+        assert arrays["poses"].shape == (3, 156)
+    [motion] = BvhSource().read(outputs / "sequence.bvh")
+    np.testing.assert_allclose(motion.poses[0, 3:], np.load(outputs / "a.npz")["pose"][3:], atol=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ("task.sequence=[fbx]", r"task\.sequence: expected some of amass, bvh, got 'fbx'"),
+        ("task.rate_hz=0", r"task\.rate_hz: expected frames a second, more than 0, got 0"),
+        (
+            "task.mesh_ckpt_path=null",
+            r"task\.sequence: a motion is of meshes, and there is no mesh regressor",
+        ),
+    ],
+)
+def test_a_motion_that_cannot_be_written_is_an_error(change, message, folders, config):
+    with pytest.raises(ValueError, match=message):
+        predict(config(*folders[0], "task.sequence=bvh", change))
+
+
+def test_an_image_is_no_motion(config):
+    with pytest.raises(
+        ValueError, match=r"task\.sequence: expected a folder of frames as task\.input, got the file"
+    ):
+        predict(config("task.sequence=amass"))
+
+
+def test_frames_of_a_motion_are_in_the_order_of_their_numbers():
+    names = ["f_9", "f_10", "f_1b", "f_1", "f"]
+    assert sorted(names, key=in_order) == ["f", "f_1", "f_1b", "f_9", "f_10"]
 
 
 def test_keypoints_that_are_missing_for_a_frame_fail_that_frame(folders, config, tmp_path):

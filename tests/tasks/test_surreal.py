@@ -67,14 +67,9 @@ def test_a_check_of_poses_without_anything_to_compare_says_so(smoke_config, tmp_
     assert "All files are there and whole" in capsys.readouterr().out
 
 
-def test_poses_keep_the_heading_that_they_bring(smoke_config, tmp_path, tree):
-    assert smoke_config(tmp_path, *chosen(tree)).data.synthesis.heading == "source"
-    assert smoke_config(tmp_path).data.synthesis.heading == "histogram"
-    cfg = smoke_config(tmp_path, *chosen(tree), "data.synthesis.heading=uniform")
-    assert cfg.data.synthesis.heading == "uniform"
-    datamodule = build(cfg.data)
+def test_the_index_lies_in_the_data_modules_cache(smoke_config, tmp_path, tree):
+    datamodule = build(smoke_config(tmp_path, *chosen(tree)).data)
     assert isinstance(datamodule.source, SurrealSource)
-    assert datamodule.source.cache_dir == datamodule.cache_dir
     datamodule.prepare_data()
     assert [path.suffix for path in datamodule.cache_dir.iterdir()] == [".jsonl"]
 
@@ -85,7 +80,6 @@ def test_an_evaluation_may_choose_the_source_and_has_the_checkpoints_bodies(smok
     merged = with_checkpoint_config(smoke_config(tmp_path, *typed), checkpoint, typed)
     assert (merged.data.source.path, merged.data.source.radial) == (str(tree), True)
     assert merged.data.source.genders == checkpoint.config["body"]["genders"]
-    assert merged.data.synthesis.heading == "source"
     assert merged.data.observation.num_points == checkpoint.config["data"]["observation"]["num_points"]
     assert isinstance(build(merged.data).source, SurrealDepthSource)
 

@@ -7,14 +7,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from datamodules.sources.clearance import Clearance
 from datamodules.sources.embedded.families import FAMILIES
 from datamodules.sources.embedded.joint_limits import within_limits
-from datamodules.sources.embedded.penetration import fit_capsules, penetration
 from datamodules.sources.embedded.procedural import draw_poses
 from datamodules.sources.embedded.recombination import Donors, Made, jittered, swapped_poses, whole_poses
-from datamodules.sources.embedded.reference import REFERENCE_CAPSULES, REFERENCE_OFFSETS
 from ljn.body import BodyModel
-from ljn.body.kinematics import joint_offsets, without_heading, world_rotations
+from ljn.body.kinematics import without_heading
 from ljn.body.skeleton import NUM_JOINTS, ROOT
 
 KINDS = ("whole", "swapped", "mixed", "procedural")
@@ -65,8 +64,7 @@ class PoseMixture:
     def __init__(self, settings: MixtureSettings, donors: Donors, body: BodyModel) -> None:
         self.settings = settings
         self.donors = donors
-        self._offsets = joint_offsets(body)
-        self._capsules = fit_capsules(body)
+        self._clearance = Clearance(body)
         families, kinds = _normalised(settings.families, FAMILIES), _normalised(settings.shares, KINDS)
         share = kinds.pop("procedural", 0.0)
         self._families = {f"{_PROCEDURAL}{name}": of_family for name, of_family in families.items()}
@@ -104,10 +102,7 @@ class PoseMixture:
 
     def depth(self, rotmat: Tensor) -> Tensor:
         """The deepest penetration of poses `(n, 24, 3, 3)` on the body or the reference skeleton: `(n,)`, metres."""
-        world = world_rotations(rotmat)
-        on_body = penetration(world, self._offsets, self._capsules)
-        on_reference = penetration(world, REFERENCE_OFFSETS, REFERENCE_CAPSULES)
-        return torch.cat([on_body, on_reference], 1).amax(1)
+        return self._clearance.depth(rotmat)
 
     def propose(self, rng: np.random.Generator, labels: np.ndarray) -> Made:
         """Poses of the kinds or families that `labels` `(n,)` name, within joint limits, not yet tested."""
@@ -140,7 +135,7 @@ class PoseMixture:
     def _draw_families(self, rng: np.random.Generator, labels: np.ndarray) -> Made:
         """Procedural poses of the families that `labels` `(n,)` name."""
         names = np.array([label.removeprefix(_PROCEDURAL) for label in labels.tolist()])
-        rotmat = draw_poses(rng, names, self._offsets)
+        rotmat = draw_poses(rng, names, self._clearance.offsets)
         rotmat[:, ROOT] = without_heading(rotmat[:, ROOT])
         return Made(rotmat, labels, np.full(len(labels), -1))
 

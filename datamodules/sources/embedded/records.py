@@ -10,7 +10,8 @@ from datamodules.sources.clips import Clips
 from datamodules.sources.embedded.joint_limits import with_square_elbows
 from datamodules.sources.embedded.mixture import MixtureSettings, PoseMixture
 from datamodules.sources.embedded.recombination import Made, clip_donors
-from ljn.body import GENDERS, BodyModel
+from datamodules.sources.shapes import draw_shapes
+from ljn.body import BodyModel
 from ljn.body.skeleton import NUM_JOINTS
 from ljn.geometry.rotations import rotmat_to_rotvec, rotvec_to_rotmat, smpl_pose_to_body_world
 
@@ -90,10 +91,7 @@ class ClipMixture:
         """The columns of `size` records, but for `has_heading`."""
         made = mixture.draw(np.random.default_rng([*key, _POSES]), size)
         rng = np.random.default_rng([*key, _SHAPES])
-        gender = rng.choice([GENDERS[name] for name in self.genders], size)
-        betas = rng.standard_normal((size, 10))
-        while (outside := np.abs(betas) > self.max_beta).any():
-            betas[outside] = rng.standard_normal(np.count_nonzero(outside))
+        gender, betas = draw_shapes(rng, size, self.genders, self.max_beta)
         return _to_pose(made), betas.astype(np.float32), gender, made.name, made.frame
 
 

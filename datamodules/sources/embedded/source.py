@@ -11,7 +11,8 @@ from datamodules.sources import PoseRecords
 from datamodules.sources.clips import Clips, read_clips, read_split
 from datamodules.sources.embedded.mixture import MixtureSettings
 from datamodules.sources.embedded.records import POSES_VERSION, ClipMixture
-from ljn.body import GENDERS, BodyModel, load_body_model
+from datamodules.sources.shapes import check_shapes
+from ljn.body import BodyModel, load_body_model
 
 _DATA = Path(__file__).parent / "data"
 
@@ -67,10 +68,7 @@ class EmbeddedSource:
         apart_share: float = 0.5,
         max_penetration_m: float = 0.05,
     ) -> None:
-        if max_beta <= 0:
-            raise ValueError(f"max_beta: expected more than 0, got {max_beta}")
-        if not genders or set(genders) - set(GENDERS):
-            raise ValueError(f"genders: expected some of {', '.join(GENDERS)}, got {list(genders)}")
+        check_shapes(genders, max_beta)
         numbers = (blend_share, apart_share, jitter_deg, max_penetration_m)
         self.settings = MixtureSettings(dict(shares), dict(families), *numbers)
         self.max_beta = max_beta

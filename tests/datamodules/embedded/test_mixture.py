@@ -5,9 +5,9 @@ import torch
 from datamodules.sources.embedded.families import FAMILIES
 from datamodules.sources.embedded.joint_limits import within_limits
 from datamodules.sources.embedded.mixture import MixtureSettings, PoseMixture
-from datamodules.sources.embedded.penetration import fit_capsules, penetration
-from datamodules.sources.embedded.reference import REFERENCE_CAPSULES, REFERENCE_OFFSETS
 from datamodules.sources.embedded.source import FAMILY_SHARES, SHARES
+from datamodules.sources.penetration import fit_capsules, penetration
+from datamodules.sources.reference import REFERENCE_CAPSULES, REFERENCE_OFFSETS
 from ljn.body.kinematics import without_heading, world_rotations
 from ljn.body.skeleton import ROOT
 

@@ -231,8 +231,8 @@ def test_one_body_serves_all_genders(tree):
 
 def test_the_config_files_hold_the_defaults():
     for name, source in (("surreal", SurrealSource), ("surreal_depth", SurrealDepthSource)):
-        config = OmegaConf.to_container(OmegaConf.load(CONF / f"{name}.yaml"), resolve=False)["source"]
+        config = OmegaConf.to_container(OmegaConf.load(CONF / f"{name}.yaml"), resolve=False)
         parameters = inspect.signature(SurrealSource).parameters | inspect.signature(source).parameters
-        for key in config.keys() - {"_target_", "_convert_", "genders", "body_path"}:
+        for key in config.keys() - {"defaults", "_target_", "_convert_", "genders", "body_path"}:
             value = tuple(config[key]) if isinstance(config[key], list) else config[key]
             assert value == parameters[key].default, key

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 import torch
 
-from datamodules.sources.embedded.penetration import fit_capsules, penetration, segment_distance
-from datamodules.sources.embedded.reference import REFERENCE_CAPSULES, REFERENCE_OFFSETS
+from datamodules.sources.penetration import fit_capsules, penetration, segment_distance
+from datamodules.sources.reference import REFERENCE_CAPSULES, REFERENCE_OFFSETS
 from ljn.body import load_body_model
 from ljn.body.kinematics import SIDES, joint_positions, world_rotations
 from ljn.body.skeleton import JOINT_INDEX, NUM_JOINTS, PARENTS

@@ -7,7 +7,7 @@ skeleton stay comparable when these change.
 
 import torch
 
-from datamodules.sources.embedded.penetration import Capsules, tested_pairs
+from datamodules.sources.penetration import Capsules, tested_pairs
 from ljn.body.kinematics import SIDES
 from ljn.body.skeleton import JOINT_INDEX, JOINT_NAMES
 

@@ -1,0 +1,154 @@
+import numpy as np
+import pytest
+import torch
+
+from datamodules.sources.amass import AmassSource
+from ljn.body import GENDERS
+from ljn.geometry.rotations import smpl_pose_to_body_world
+
+RELEASES = {
+    "SMPL-H": {"width": 156, "gender": np.array(b"female"), "mocap_framerate": np.array(120.0), "betas": 16},
+    "SMPL+H G": {"width": 156, "gender": np.array("male"), "mocap_framerate": np.array(100), "betas": 10},
+    "SMPL-X": {"width": 165, "gender": np.array("neutral"), "mocap_frame_rate": np.array(60.0), "betas": 16},
+    "SMPL": {"width": 72, "gender": np.array(["female"]), "mocap_framerate": np.array([50.0]), "betas": 10},
+}
+
+
+def fields_of(release, motion, **changes):
+    """A file's fields as a release has them, of a motion's poses `(T, 72)` in a world that is z up."""
+    about = dict(RELEASES[release])
+    number, width = len(motion), about.pop("width")
+    whole = np.random.default_rng(1).standard_normal((number, width))
+    whole[:, :66] = motion[:, :66]
+    if width == 72:
+        whole = motion
+    fields = {
+        **about,
+        "poses": whole,
+        "trans": np.zeros((number, 3)),
+        "betas": np.linspace(-1, 1, about["betas"]),
+        **changes,
+    }
+    if release == "SMPL-X":
+        fields |= {"surface_model_type": np.array("smplx"), "pose_jaw": np.zeros((number, 3))}
+        fields |= {"markers_latent_vids": np.array({"a": 1}, object)}
+    return {name: value for name, value in fields.items() if value is not None}
+
+
+@pytest.fixture
+def write_amass(tmp_path, some_poses):
+    """Writes a file and returns its folder and its poses, in body world."""
+
+    def write(release="SMPL-H", place="CMU/01/01_01_poses.npz", number=24, **changes):
+        poses = smpl_pose_to_body_world(torch.from_numpy(some_poses(number))).numpy()
+        path = tmp_path / "amass" / place
+        path.parent.mkdir(parents=True, exist_ok=True)
+        np.savez(path, **fields_of(release, poses, **changes))
+        return path, poses
+
+    return write
+
+
+@pytest.mark.parametrize("release", RELEASES)
+def test_every_release_gives_the_joints_and_shapes_of_its_files(release, write_amass, joints_of):
+    path, poses = write_amass(release)
+    source = AmassSource(path, rate_hz=None, genders=("female", "male", "neutral"))
+    recordings = source.recordings
+    assert (recordings.subjects, recordings.clips, recordings.notes) == (("01",), ("01_01_poses",), {})
+    np.testing.assert_allclose(joints_of(recordings.pose), joints_of(poses), atol=1e-4)
+    np.testing.assert_allclose(recordings.pose[:, :66], poses[:, :66], atol=1e-5)
+    if release != "SMPL":
+        assert not recordings.pose[:, 66:].any(), "hands at rest"
+    betas = np.linspace(-1, 1, RELEASES[release]["betas"])[:10]
+    np.testing.assert_allclose(recordings.betas, np.tile(betas, (24, 1)), atol=1e-6)
+    text = RELEASES[release]["gender"].reshape(-1)[0]
+    assert set(recordings.gender) == {GENDERS[text.decode() if isinstance(text, bytes) else str(text)]}
+
+
+def test_frames_come_at_the_rate_that_is_asked_for(write_amass):
+    path, poses = write_amass(number=60)  # at 120 Hz
+    source = AmassSource(path, rate_hz=10)
+    np.testing.assert_array_equal(source.recordings.frame, np.arange(0, 60, 12))
+    np.testing.assert_allclose(source.recordings.pose[1, :66], poses[12, :66], atol=1e-5)
+    assert len(AmassSource(path, rate_hz=10, stride=2).recordings.frame) == 3
+    assert len(AmassSource(path, rate_hz=500).recordings.frame) == 60
+
+
+@pytest.mark.parametrize(
+    ("changes", "note"),
+    [
+        ({"gender": None}, "gender: missing, or a Python object; it is drawn"),
+        ({"gender": np.array("female", object)}, "gender: missing, or a Python object; it is drawn"),
+        ({"gender": np.array("unknown")}, "gender: expected one of female, male, neutral, got 'unknown'; it is drawn"),
+        ({"betas": None}, "betas: missing; they are drawn"),
+        ({"mocap_framerate": None}, "mocap_framerate: missing, so all frames count"),
+        ({"mocap_framerate": np.array(np.nan)}, "mocap_framerate: missing, so all frames count"),
+    ],
+)  # fmt: skip
+def test_what_can_be_passed_over_is_noted(changes, note, write_amass, caplog):
+    path, _ = write_amass(**changes)
+    source = AmassSource(path.parents[2])
+    assert source.recordings.notes == {"CMU/01/01_01_poses.npz": [note]}
+    assert note in caplog.text
+    assert set(source.recordings.gender) == {-1 if "gender" in changes else GENDERS["female"]}
+
+
+@pytest.mark.parametrize("gender", [b"male", "male", "b'male'", "M", " Male"])
+def test_genders_are_read_however_they_were_written(gender, write_amass):
+    path, _ = write_amass(gender=np.array(gender))
+    assert set(AmassSource(path).recordings.gender) == {GENDERS["male"]}
+
+
+def test_bad_files_are_named_and_counted_and_cost_the_others_nothing(write_amass, caplog):
+    path, _ = write_amass()
+    root = path.parents[2]
+    whole = path.read_bytes()
+    bad = {
+        "CMU/02/truncated.npz": (whole[: len(whole) // 2], "it cannot be read"),
+        "CMU/02/empty.npz": (b"", "it cannot be read"),
+        "CMU/02/text.npz": (b"<html>404</html>", "it cannot be read"),
+    }
+    for place, (content, _) in bad.items():
+        (root / place).parent.mkdir(exist_ok=True)
+        (root / place).write_bytes(content)
+    write_amass(place="CMU/03/no_poses.npz", poses=None)
+    write_amass(place="CMU/03/odd.npz", poses=np.zeros((5, 63)))
+    write_amass(place="CMU/03/nan.npz", poses=np.full((5, 156), np.nan))
+    poses = np.zeros((30, 156))
+    poses[4:9, 7] = np.inf
+    write_amass(place="CMU/04/some_nan.npz", poses=poses, mocap_framerate=np.array(10))
+    write_amass(place="CMU/04/shape.npz", poses=None)
+    write_amass(place="CMU/04/neutral_stagei.npz", poses=None)
+    recordings = AmassSource(root).recordings
+    expected = {place: why for place, (_, why) in bad.items()} | {
+        "CMU/03/no_poses.npz": "poses: no such field",
+        "CMU/03/odd.npz": r"poses: expected axis-angle values (T, N) with N one of 66, 72, 156, 165, got (5, 63)",
+        "CMU/03/nan.npz": "poses: NaN, or rotations that no joint has, in all 5 frames",
+    }
+    assert recordings.skipped.keys() == expected.keys()
+    for place, why in expected.items():
+        assert why in recordings.skipped[place]
+        assert f"{place} left out: " in caplog.text
+    assert "6 of 8 files left out; the first is CMU/02/empty.npz" in caplog.text
+    assert recordings.subjects == ("CMU/01", "CMU/04")
+    assert recordings.notes == {
+        "CMU/04/some_nan.npz": ["poses: NaN, or rotations that no joint has, in 5 of 30 frames, left out"]
+    }
+    assert recordings.frame[recordings.clip == 1].tolist() == [*range(4), *range(9, 30)]
+
+
+def test_a_folder_without_a_file_that_can_be_read_is_an_error(write_amass, tmp_path):
+    path, _ = write_amass(poses=None)
+    with pytest.raises(
+        ValueError, match=r"none of 1 files can be read; the first is .*01_01_poses.npz: poses: no"
+    ):
+        AmassSource(path.parents[2]).check()
+    with pytest.raises(FileNotFoundError, match=r"data\.source\.path: no file or folder .*nowhere"):
+        AmassSource(tmp_path / "nowhere").check()
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(FileNotFoundError, match=r"data\.source\.path: no \.npz file in .*empty"):
+        AmassSource(tmp_path / "empty").check()
+    with pytest.raises(
+        ValueError, match=r"data\.source\.path: expected a folder of \.npz files, or one, got null"
+    ):
+        AmassSource().check()
