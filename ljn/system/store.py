@@ -44,7 +44,7 @@ class StoredFrame(NamedTuple):
         """The prediction, without cloud and mesh; None of a frame that failed."""
         if "joints" not in self.arrays:
             return None
-        arrays = {name: value for name, value in self.arrays.items() if name != "mask"}
+        arrays: dict[str, Any] = {name: value for name, value in self.arrays.items() if name != "mask"}
         return Prediction(points=np.zeros((0, 6), np.float32), **arrays)
 
 
@@ -146,4 +146,7 @@ class Store:
         import cv2
 
         for path in self.picture_files():
-            yield cv2.imread(str(path), cv2.IMREAD_COLOR)[..., ::-1]
+            picture = cv2.imread(str(path), cv2.IMREAD_COLOR)
+            if picture is None:
+                raise ValueError(f"'{path}' is damaged; remove the folder, and give the same command again")
+            yield picture[..., ::-1]

@@ -89,7 +89,7 @@ def ar(cfg: DictConfig) -> dict[str, float]:
     if not summary["predicted"]:
         reasons = "; ".join(list(summary["errors"])[:3])
         raise ValueError(f"input: none of {summary['frames']} frames could be predicted: {reasons}")
-    metrics = {
+    metrics: dict[str, float] = {
         name: float(summary[name])
         for name in ("frames", "failed", "iou", "mpjpe_mm", "apve_mm")
         if name in summary
