@@ -10,7 +10,7 @@ ROOMS = (
     "ljn.reading", "ljn.optional", "ljn.geometry", "ljn.body", "ljn.render", "ljn.cloud", "ljn.data", "ljn.drawing",
     "ljn.nets", "ljn.losses", "ljn.metrics", "ljn.refinement", "ljn.modules", "ljn.building", "ljn.runs",
     "ljn.pipeline", "ljn.demo", "ljn.report", "ljn.system", "ljn.benchmark", "ljn.tasks", "ljn.body.build",
-    "datamodules",     "callbacks", "run",
+    "datamodules", "callbacks", "run",
 )  # fmt: skip
 """From the ground up. Only what stands above all of `ljn` may import `datamodules` or `callbacks`."""
 
