@@ -17,6 +17,7 @@ from datamodules.posing import BodySynthesizer, SampleKey
 from datamodules.rgb import kernels
 from datamodules.rgb.backgrounds import Background
 from datamodules.rgb.chain import Photo, Photography
+from datamodules.rgb.drawing import drawn
 from datamodules.rgb.look import Look
 from datamodules.rgb.surface import surface_of
 from datamodules.scenes import Scene, mirrored
@@ -208,36 +209,8 @@ class RgbSynthesizer(BodySynthesizer):
         self, vertices: np.ndarray, gender: int, intrinsics: np.ndarray, look: Look
     ) -> tuple[np.ndarray, np.ndarray]:
         """The person `(2 h, 2 w, 3)` float32, linear RGB, black around; and the mask `(2 h, 2 w)` uint8."""
-        surface = surface_of(self._body_of[gender])
-        height, width = _FINER * self.recipe.height_px, _FINER * self.recipe.width_px
-        # A `Camera` has its principal point in its image. Sheared, the body looks the same to one that has.
-        fx, fy, cx, cy = intrinsics
-        camera = Camera(fx, fy, width / 2, height / 2, width, height)
-        sheared = vertices.copy()
-        sheared[:, 0] += vertices[:, 2] * ((cx - camera.cx) / fx)
-        sheared[:, 1] += vertices[:, 2] * ((cy - camera.cy) / fy)
-        normals = kernels.vertex_normals(vertices.astype(np.float32), surface.faces)
-        facing = kernels.facing(sheared, surface.faces)
-        surface = surface._replace(faces=surface.faces[facing], regions=surface.regions[facing])
-        seen = self._renderer.fragments(
-            torch.from_numpy(sheared)[None], torch.from_numpy(surface.faces), camera
-        )
-        face_ids = seen.face_ids[0].numpy()
-        image = kernels.paint(
-            *(face_ids, seen.barycentrics[0].numpy(), normals),
-            *surface,
-            *(
-                look.colours,
-                look.patterns,
-                look.wear,
-                look.gloss,
-                look.cuts,
-                look.lights,
-                look.ambient,
-                look.shift,
-            ),
-        )
-        return image, (face_ids >= 0).astype(np.uint8)
+        size = _FINER * self.recipe.height_px, _FINER * self.recipe.width_px
+        return drawn(vertices, surface_of(self._body_of[gender]), look, intrinsics, size, self._renderer)
 
 
 @contextmanager

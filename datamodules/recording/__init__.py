@@ -1,0 +1,6 @@
+"""Recordings that are rendered: a person before a green curtain, as an RGB-D sensor sees it, with the truth."""
+
+from datamodules.recording.stage import Curtain
+from datamodules.recording.synthetic import SyntheticRecording, Truth
+
+__all__ = ["Curtain", "SyntheticRecording", "Truth"]

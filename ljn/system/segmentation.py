@@ -1,0 +1,271 @@
+"""The person's pixels in a frame of colour and depth, before a green curtain (thesis, section 4.1)."""
+
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from ljn.geometry.camera import Camera
+from ljn.pipeline.depth import AREA_M2
+from ljn.pipeline.person import Person, find_person
+from ljn.system.floor import find_floor, heights_m, rays, tolerance_m
+from ljn.system.recording import RgbdFrame
+
+_GREENER = 0.06
+"""By this share of a pixel's brightness its green exceeds red and blue, where it may be the curtain's."""
+_DARKEST = 60
+"""The least sum of a colour's channels, of 765, that says anything of its hue."""
+_LEAST_GREEN = 0.04
+_LIKE, _OFF = 0.62, 0.45
+"""A pixel is the curtain's where it is at least this far on the way from grey to the curtain's colour, and no farther
+from that way than the second, as shares of the way."""
+_BEFORE_M = 0.12
+"""The curtain's folds reach no farther forward."""
+_BAND_PX, _AROUND_PX = 5, 15
+_CONTRAST = 40.0
+"""Colours that differ by less, of 255 in each channel, do not say where the person ends: depth does."""
+_RING_PX, _LEAST_RING = 12, 0.35
+_MOST_GREEN = 0.10
+_OTHER_M2, _OTHER_M = 0.15, 0.9
+"""What is larger and higher than this is a second person."""
+
+
+class Green(NamedTuple):
+    """A curtain's colour.
+
+    Attributes:
+        direction: `(2,)` float32, from grey to its chromaticity (shares of red and green in a colour).
+        share: Share of the image that is so coloured.
+    """
+
+    direction: np.ndarray
+    share: float
+
+
+class GreenCurtain:
+    """Finds a person before a green curtain: by depth first, at the border by colour.
+
+    The curtain's colour is estimated from each image, so curtains and lights may differ, and vary over the image. Its
+    surface is fitted to the depth of what has that colour, and the floor is found; what stands before the curtain and
+    on the floor, and hangs together in space, is the person. In a band of some pixels along its outline, where a depth
+    image is ragged, each pixel is then asked whether its colour is nearer to that of the person or of what is behind,
+    as both are around it: so the curtain's light on hair and skin does not count as curtain.
+
+    The person may reach beyond the curtain's edges, and the curtain may go on over the floor.
+
+    Attributes:
+        facts: What was found in the last frame: `green` (share of the image), `curtain_m` (its depth behind the person,
+            where it was measured), `has_floor`, `area_m2`.
+    """
+
+    def __init__(self) -> None:
+        self.facts: dict[str, object] = {}
+
+    def __call__(self, frame: RgbdFrame, camera: Camera) -> np.ndarray:
+        """The person's pixels.
+
+        Args:
+            frame: The frame, with colours.
+            camera: Its camera.
+
+        Returns:
+            `(H, W)` bool.
+
+        Raises:
+            ValueError: The frame has no depth or no colours, the curtain is not there or not green, there is no person
+                or more than one, or the person's clothes are green.
+        """
+        depth, rgb = _images(frame, camera)
+        green, shares = find_green(rgb)
+        is_green = _has_colour(shares, green)
+        is_known = rgb.any(-1)
+        self.facts = {"green": round(green.share, 3)}
+        curtain = _curtain_depth(depth, is_green, camera)
+        is_before = depth > 0
+        if curtain is not None:
+            is_before &= depth < curtain - _BEFORE_M
+        floor = find_floor(np.where(is_before, depth, np.float32(0)), camera)
+        if floor is not None:
+            is_before &= heights_m(depth, camera, floor) > tolerance_m(depth)
+        self.facts["has_floor"] = floor is not None
+        person = one_person(np.where(is_before, depth, np.float32(0)), camera)
+        is_person = person.depth > 0
+        self.facts["area_m2"] = round(person.area_m2, 3)
+        if curtain is not None:
+            self.facts["curtain_m"] = round(float(np.median(curtain[is_person])), 3)
+        _check_colours(is_person, is_green, is_known)
+        return _refined(is_person, is_green & ~is_before, rgb, depth)
+
+
+def _images(frame: RgbdFrame, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    if frame.error is not None or frame.depth is None:
+        raise ValueError(f"frame: expected a depth image, got none ({frame.error or 'nothing was read'})")
+    if frame.rgb is None:
+        raise ValueError(
+            "frame: expected colours, got none; a green curtain is found by its colour: segmentation=depth_only does "
+            "without"
+        )
+    for name, image in (("depth", frame.depth), ("rgb", frame.rgb)):
+        if image.shape[:2] != (camera.height, camera.width):
+            raise ValueError(
+                f"frame.{name}: expected the camera's {camera.width} x {camera.height} (width x height) pixels, got "
+                f"{image.shape[1]} x {image.shape[0]}; register colours to the depth image"
+            )
+    return frame.depth, frame.rgb
+
+
+def find_green(rgb: np.ndarray) -> tuple[Green, np.ndarray]:
+    """The curtain's colour in an image, and the chromaticity of its pixels.
+
+    Args:
+        rgb: `(H, W, 3)` uint8.
+
+    Returns:
+        The colour; and `(H, W, 2)` float32, the shares of red and green in each pixel's colour, less a third.
+
+    Raises:
+        ValueError: Hardly anything is green.
+    """
+    red, green, blue = cv2.split(cv2.GaussianBlur(rgb, (3, 3), 0))
+    total = cv2.add(cv2.add(red, green, dtype=cv2.CV_32F), blue, dtype=cv2.CV_32F)
+    excess = cv2.subtract(green, cv2.max(red, blue), dtype=cv2.CV_32F)
+    is_seed = (excess > _GREENER * total) & (total > _DARKEST)
+    share = float(np.count_nonzero(is_seed)) / is_seed.size
+    if share < _LEAST_GREEN:
+        raise ValueError(
+            f"frame.rgb: expected a green curtain behind the person, got {100 * share:.1f} % of the image that is "
+            f"green, less than {100 * _LEAST_GREEN:.0f} %; is the curtain there, and lit? segmentation=depth_only does "
+            "without one"
+        )
+    total = np.maximum(total, 1)
+    shares = np.stack([red / total, green / total], -1) - np.float32(1 / 3)
+    seeds = shares[is_seed]
+    return Green(np.median(seeds[:: max(1, len(seeds) // 5000)], axis=0), share), shares
+
+
+def _has_colour(shares: np.ndarray, green: Green) -> np.ndarray:
+    """Whether pixels have the curtain's colour, `(H, W)` bool; `shares` as of `find_green`."""
+    length = float(np.linalg.norm(green.direction))
+    unit = green.direction / length
+    along = shares[..., 0] * unit[0] + shares[..., 1] * unit[1]
+    aside = shares[..., 1] * unit[0] - shares[..., 0] * unit[1]
+    return (along > _LIKE * length) & (np.abs(aside) < _OFF * length)
+
+
+def _curtain_depth(depth: np.ndarray, is_green: np.ndarray, camera: Camera) -> np.ndarray | None:
+    """Depth `(H, W)` of the plane that the curtain hangs in, metres; None where too little of it was measured."""
+    rows, columns = np.nonzero(is_green[::2, ::2] & (depth[::2, ::2] > 0))
+    if 4 * len(rows) < 0.3 * np.count_nonzero(is_green):
+        return None
+    step = max(1, len(rows) // 3000)
+    v, u = 2 * rows[::step], 2 * columns[::step]
+    z = depth[v, u].astype(np.float64)
+    far = np.percentile(z, 60)
+    is_on = np.abs(z - far) < 0.5  # not a green floor, nor what is green before the curtain
+    across, down = rays(camera)
+    terms = np.stack([across[0, u], down[v, 0], np.ones(len(u))], -1)  # of a plane 1 / z is linear in these
+    plane = np.array([0.0, 0.0, 1 / far])
+    for _ in range(3):
+        if np.count_nonzero(is_on) < 50:
+            return None
+        plane = np.linalg.lstsq(terms[is_on], 1 / z[is_on], rcond=None)[0]
+        is_on = np.abs(1 / np.maximum(terms @ plane, 1e-3) - z) < _BEFORE_M
+    inverse = np.float32(plane[0]) * across + (np.float32(plane[1]) * down + np.float32(plane[2]))
+    return 1 / np.maximum(inverse, np.float32(0.05))
+
+
+def one_person(metres: np.ndarray, camera: Camera) -> Person:
+    """The only person in a depth image `(H, W)` of what is before curtain, walls and floor, metres; 0 is nothing.
+
+    Raises:
+        ValueError: There is nobody, or more than one.
+    """
+    nobody = "frame.depth: no person: "
+    if not metres.any():
+        raise ValueError(f"{nobody}nothing stands before the background")
+    person = find_person(metres, camera)
+    if person.area_m2 < AREA_M2[0]:
+        raise ValueError(
+            f"{nobody}the largest thing before the background measures {person.area_m2:.2f} square metres, less than "
+            f"{AREA_M2[0]:g}"
+        )
+    others = np.where(person.depth > 0, np.float32(0), metres)
+    is_crowd = person.area_m2 > AREA_M2[1]
+    if not is_crowd and person.foreign_m2 > _OTHER_M2:
+        other = find_person(others, camera)
+        rows = np.flatnonzero(other.depth.any(1))
+        z = float(np.median(other.depth[other.depth > 0]))
+        is_crowd = other.area_m2 > _OTHER_M2 and np.ptp(rows) * z / camera.fy > _OTHER_M
+    if is_crowd:
+        raise ValueError(
+            "frame.depth: several persons stand before the background, or something of a person's size; one alone is "
+            "expected"
+        )
+    return person
+
+
+def _check_colours(is_person: np.ndarray, is_green: np.ndarray, is_known: np.ndarray) -> None:
+    inside = cv2.erode(is_person.astype(np.uint8), _disc(3)) > 0
+    inside &= is_known
+    green = np.count_nonzero(inside & is_green) / max(1, np.count_nonzero(inside))
+    if green > _MOST_GREEN:
+        raise ValueError(
+            f"frame.rgb: the person's clothes are green: {100 * green:.0f} % of the person has the curtain's colour; "
+            "wear other ones, or take segmentation=depth_only"
+        )
+    person = is_person.astype(np.uint8)
+    ring = (cv2.dilate(person, _disc(_RING_PX)) > cv2.dilate(person, _disc(4))) & is_known
+    rows = np.flatnonzero(is_person.any(1))
+    ring[rows[0] + int(0.8 * (rows[-1] - rows[0])) :] = False  # the floor
+    around = np.count_nonzero(ring & is_green) / max(1, np.count_nonzero(ring))
+    if around < _LEAST_RING:
+        raise ValueError(
+            f"frame.rgb: expected a green curtain behind the person, got {100 * around:.0f} % green around it; is the "
+            "curtain large enough, and green? segmentation=depth_only does without one"
+        )
+
+
+def _refined(is_person: np.ndarray, is_curtain: np.ndarray, rgb: np.ndarray, depth: np.ndarray) -> np.ndarray:
+    """The person `(H, W)` with its outline where colours put it."""
+    rows, columns = np.flatnonzero(is_person.any(1)), np.flatnonzero(is_person.any(0))
+    pad = 2 * _AROUND_PX
+    window = (
+        slice(max(0, rows[0] - pad), rows[-1] + pad + 1),
+        slice(max(0, columns[0] - pad), columns[-1] + pad + 1),
+    )
+    person, colours = is_person[window].astype(np.uint8), rgb[window].astype(np.float32)
+    is_known = rgb[window].any(-1)
+    sure = cv2.erode(person, _disc(_BAND_PX // 2))
+    grown = cv2.dilate(person, _disc(_BAND_PX // 2))
+    # Hair and dark cloth are not always measured: there the band is wide.
+    lost = (depth[window] == 0) & ~is_curtain[window] & is_known
+    grown |= lost.astype(np.uint8) & cv2.dilate(person, _disc(_RING_PX))
+    band = (grown > sure) & is_known
+    inner, outer = sure.astype(bool) & ~is_curtain[window], ~grown.astype(bool) & is_known
+    near, behind = _mean(colours, inner), _mean(colours, outer)
+    towards = near - behind
+    contrast = (towards * towards).sum(-1)
+    share = ((colours - behind) * towards).sum(-1) / np.maximum(contrast, 1)
+    is_clear = band & (contrast > _CONTRAST**2)  # also false where either is not known: NaN
+    mask = np.where(is_clear, share > 0.5, person > 0)
+    mask = cv2.medianBlur(mask.astype(np.uint8), 3)
+    number, labels = cv2.connectedComponents(mask, connectivity=8)
+    is_kept = np.zeros(number, bool)
+    is_kept[np.unique(labels[sure > 0])] = True
+    is_kept[0] = False
+    result = np.zeros(is_person.shape, bool)
+    result[window] = is_kept[labels]
+    return result
+
+
+def _mean(colours: np.ndarray, chosen: np.ndarray) -> np.ndarray:
+    """The mean colour `(h, w, 3)` of what is chosen `(h, w)` around each pixel; NaN where nothing is."""
+    weight = chosen.astype(np.float32)
+    size = (_AROUND_PX, _AROUND_PX)
+    sums = cv2.boxFilter(colours * weight[..., None], -1, size, normalize=False)
+    counts = cv2.boxFilter(weight, -1, size, normalize=False)
+    return sums / np.where(counts > 0.5, counts, np.float32(np.nan))[..., None]
+
+
+def _disc(radius: int) -> np.ndarray:
+    return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
