@@ -56,7 +56,10 @@ def test_all_else_is_left_alone():
 def test_a_key_that_has_moved_is_named(run_py):
     done = run_py("input=depth.png", check=False)
     assert done.returncode == 1
-    assert done.stderr == "error: input: only task=predict and task=ar read this; add task=predict, or leave it out\n"
+    assert (
+        done.stderr
+        == "error: input: only task=predict and task=ar read this; add task=predict, or leave it out\n"
+    )
     assert prepare_arguments(["task=predict", "input=a=b.png"]) == ["task=predict", "task.input='a=b.png'"]
 
 
