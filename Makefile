@@ -1,12 +1,15 @@
-# make demo | train-demo | test | lint | bench | install: each installs what it needs into .venv first.
+# make demo | ar-demo | train-demo | test | lint | bench | install: each installs what it needs into .venv first.
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo train-demo test lint bench install clean
+.PHONY: demo ar-demo train-demo test lint bench install clean
 
 demo: install
 	$(BIN)/python run.py task=demo refine=true
+
+ar-demo: install
+	$(BIN)/python run.py task=ar recording=synthetic segmentation=curtain refine=fast
 
 train-demo: install
 	$(BIN)/python run.py sweep=demo

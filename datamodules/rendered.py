@@ -4,7 +4,7 @@ import hashlib
 import logging
 import math
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, cast
 
@@ -23,10 +23,10 @@ from datamodules.batches import (
 )
 from datamodules.cache import cached_records, cached_samples
 from datamodules.posing import BodySynthesizer, SampleKey
-from datamodules.sources import PoseRecords, PoseSource
+from datamodules.sources import Examinable, PoseRecords, PoseSource
 from datamodules.synthesis import concatenate
 from ljn.body import BodyModel, load_body_models
-from ljn.data import SPLITS, Batch, DataModule
+from ljn.data import SPLITS, Batch, DataModule, Finding
 from ljn.geometry.rotations import rotvec_to_rotmat
 
 _LOG = logging.getLogger(__name__)
@@ -168,6 +168,11 @@ class RenderedDataModule(DataModule):
             "bodies": {body.gender: body.hash for body in self.bodies},
             "seeds": {"seed": self.seed, "pool_seed": self.pool_seed, "eval_seed": self.eval_seed},
         }
+
+    def examine(self, number: int | None) -> Iterator[Finding]:
+        """See `DataModule`: what the source finds."""
+        if isinstance(self.source, Examinable):
+            yield from self.source.examine(self.bodies, number)
 
     def prepare_data(self) -> None:
         """Check every file and package that will be needed, before anything expensive starts."""

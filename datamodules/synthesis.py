@@ -4,7 +4,7 @@ import math
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -15,7 +15,7 @@ from datamodules.placement import HEADINGS
 from datamodules.posing import BodySynthesizer, SampleKey
 from datamodules.scenes import KeptScenes, Scene, mirrored
 from datamodules.sensor import Sensor
-from datamodules.sources import PoseRecords
+from datamodules.sources import ImageSource, PoseRecords
 from ljn.body import BodyModel
 from ljn.body.skeleton import NUM_JOINTS
 from ljn.cloud.observation import ObservationRecipe, observe, stack_observations
@@ -256,6 +256,27 @@ class DepthSynthesizer(BodySynthesizer):
         if not is_left.any():
             return None, None
         return fill_missing(np.where(is_left[:, None], keypoints, np.nan)), is_left.astype(np.float32)
+
+
+class RecordedSynthesizer(DepthSynthesizer):
+    """Samples of records that have depth images of their own: these are seen as they are, without anything added.
+
+    Args:
+        source: Where the images come from.
+        records: Its records.
+        others: As `DepthSynthesizer`; of the settings, those of keypoints and joints count.
+    """
+
+    def __init__(self, source: ImageSource, records: PoseRecords, *others: Any) -> None:
+        super().__init__(records, *others)
+        self.records = records  # with the headings that the images show
+        self.source = source
+
+    def _render(self, keys: Sequence[SampleKey], with_depth: bool) -> Scene:
+        return self.source.scene(self.records, [index for _, index in keys], with_depth)
+
+    def _with_noise(self, keys: Sequence[SampleKey], scene: Scene) -> Scene:
+        return scene
 
 
 def concatenate(batches: Iterable[Batch], num_samples: int) -> dict[str, Tensor]:

@@ -17,8 +17,8 @@ from datamodules.placement import check_margin
 from datamodules.posing import smallest_camera
 from datamodules.rendered import RenderedDataModule
 from datamodules.sensor import Sensor
-from datamodules.sources import PoseSource
-from datamodules.synthesis import SAMPLES_VERSION, DepthSynthesizer, SynthesisSettings
+from datamodules.sources import ImageSource, PoseSource
+from datamodules.synthesis import SAMPLES_VERSION, DepthSynthesizer, RecordedSynthesizer, SynthesisSettings
 from ljn.cloud.lifting import depth_at
 from ljn.cloud.normals import get_normal_estimator
 from ljn.cloud.observation import ObservationRecipe
@@ -35,7 +35,7 @@ class SyntheticDepthDataModule(RenderedDataModule):
     """Bodies from a pose source, seen by a depth camera; see `RenderedDataModule`.
 
     Args:
-        source: Where poses come from.
+        source: Where poses come from, and of an `ImageSource` depth images, too.
         camera: The depth camera.
         synthesis: How a pose becomes a sample.
         observation: How its depth image is observed.
@@ -205,7 +205,7 @@ class SyntheticDepthDataModule(RenderedDataModule):
 
     def _synthesizer(self, split: str) -> DepthSynthesizer:
         is_train = split == "train"
-        return DepthSynthesizer(
+        arguments = (
             self._records_of(split),
             self.bodies,
             self.camera,
@@ -217,6 +217,9 @@ class SyntheticDepthDataModule(RenderedDataModule):
             -(-BLOCK // max(1, self.num_workers)) if is_train and self.reuse > 1 else 0,
             self.sensor,
         )
+        if isinstance(self.source, ImageSource):
+            return RecordedSynthesizer(self.source, *arguments)
+        return DepthSynthesizer(*arguments)
 
     @property
     def _settings(self) -> str:

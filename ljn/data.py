@@ -1,8 +1,8 @@
 """The contract between data, models and tasks: what a batch holds, what a data module can say of itself."""
 
 from abc import abstractmethod
-from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any, TypedDict
+from collections.abc import Iterator, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple, TypedDict
 
 import numpy as np
 import torch
@@ -58,6 +58,20 @@ class Batch(TypedDict, total=False):
     sample_id: Tensor
 
 
+class Finding(NamedTuple):
+    """What an examination of data has found in one place.
+
+    Attributes:
+        text: A line for the user.
+        values: Numbers by name; of all findings' numbers of one name, the largest counts.
+        is_wrong: Whether the data cannot be used as they are.
+    """
+
+    text: str
+    values: Mapping[str, float]
+    is_wrong: bool = False
+
+
 class DataModule(LightningDataModule):
     """Base of the data modules: what tasks ask of one beside its loaders.
 
@@ -108,6 +122,14 @@ class DataModule(LightningDataModule):
         of each sample's kind, in the order of their numbers.
         """
         return {}
+
+    def examine(self, number: int | None) -> Iterator[Finding]:
+        """What is found when the data's files are held against themselves; nothing where there is nothing to compare.
+
+        Args:
+            number: How many clips or frames to look at; None: all.
+        """
+        yield from ()
 
     @abstractmethod
     def describe(self, splits: Sequence[str] = SPLITS) -> dict[str, Any]:

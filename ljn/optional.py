@@ -28,6 +28,12 @@ def import_huggingface_hub() -> Any:
     )
 
 
+def import_h5py() -> Any:
+    """The `h5py` module; an `ImportError` where it is missing."""
+    fix = "h5py` (the extra `hdf5`), which MATLAB's files of version 7.3 need; or save them with -v7"
+    return _import("h5py", fix)
+
+
 def import_pyrender() -> Any:
     """The `pyrender` module, set up to draw through EGL, without a display; an `ImportError` as `import_open3d`."""
     # pyrender reads these when it is imported; what the user has chosen stays.

@@ -9,8 +9,8 @@ ROOT = Path(__file__).parents[1]
 ROOMS = (
     "ljn.reading", "ljn.optional", "ljn.geometry", "ljn.body", "ljn.render", "ljn.cloud", "ljn.data", "ljn.drawing",
     "ljn.nets", "ljn.losses", "ljn.metrics", "ljn.refinement", "ljn.modules", "ljn.building", "ljn.runs",
-    "ljn.pipeline", "ljn.demo", "ljn.report", "ljn.benchmark", "ljn.tasks", "ljn.body.build", "datamodules",
-    "callbacks", "run",
+    "ljn.pipeline", "ljn.demo", "ljn.report", "ljn.system", "ljn.benchmark", "ljn.tasks", "ljn.body.build",
+    "datamodules", "callbacks", "run",
 )  # fmt: skip
 """From the ground up. Only what stands above all of `ljn` may import `datamodules` or `callbacks`."""
 

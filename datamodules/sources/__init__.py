@@ -1,21 +1,23 @@
 """Sources of poses. Each yields `PoseRecords` for a split; how they are rendered is not its concern."""
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
 
+from datamodules.scenes import Scene
+from ljn.body import BodyModel
 from ljn.body.kinematics import without_heading
 from ljn.body.skeleton import NUM_JOINTS
-from ljn.data import SPLITS
+from ljn.data import SPLITS, Finding
 from ljn.geometry.rotations import BODY_TO_OPENGL, rotmat_to_rotvec, rotvec_to_rotmat
 
-__all__ = ["SPLITS", "PoseRecords", "PoseSource"]
+__all__ = ["SPLITS", "Examinable", "ImageSource", "PoseRecords", "PoseSource"]
 
 _HASH_STEP = 1e-5
 
@@ -139,4 +141,22 @@ class PoseSource(Protocol):
 
     def records(self, split: str, num_records: int, seed: int) -> PoseRecords:
         """`num_records` records of a split (one of `SPLITS`); the same ones for the same seed."""
+        ...
+
+
+@runtime_checkable
+class ImageSource(Protocol):
+    """A `PoseSource` whose records have depth images of their own, which are taken in place of rendered ones."""
+
+    def scene(self, records: PoseRecords, rows: Sequence[int], with_depth: bool) -> Scene:
+        """The bodies of some records before the camera that saw them; without `with_depth` images are `(0, 0)`."""
+        ...
+
+
+@runtime_checkable
+class Examinable(Protocol):
+    """A `PoseSource` that can hold what its files say against itself."""
+
+    def examine(self, bodies: Sequence[BodyModel], num_clips: int | None) -> Iterator[Finding]:
+        """What is found in so many clips from all over its files, or in all of them; with these bodies."""
         ...

@@ -28,6 +28,19 @@ _DATA_DIR = Path(__file__).parent / "data"
 _KEYS = ("v_template", "shapedirs", "posedirs", "J_regressor", "weights", "kintree_table", "f")
 """The arrays of a file, under SMPL's own names."""
 _NOT_SMPL = "Give a SMPL model file (not SMPL+H, SMPL-X or MANO)."
+_FAMILY = {52: "SMPL+H", 55: "SMPL-X", 16: "MANO", 5: "FLAME"}
+"""Of SMPL's relatives, the numbers of joints."""
+_SMPLX_VERTICES = 10475
+_SMPL_HOME = "https://smpl.is.tue.mpg.de"
+_FOLDERS = (
+    "",
+    "smpl",
+    "models",
+    "smpl/models",
+    "SMPL_python_v.1.1.0/smpl/models",
+    "SMPL_python_v.1.0.0/smpl/models",
+)
+"""Where in a user's folder the files may lie: as smplx has them, and as the official archives unpack."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,8 +142,8 @@ def load_body_model(path: str | Path | None = None, gender: str = "neutral") -> 
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(
-            f"path: there is no body model file {path}. Leave the path out for the embedded body; the "
-            "official files are at https://smpl.is.tue.mpg.de, after registration."
+            f"path (body.path): there is no body model file {path}. Leave the path out for the embedded body. "
+            f"{_OFFICIAL}"
         )
     if path.suffix.lower() not in _READERS:
         raise ValueError(f"path: a body model should be a .npz or .pkl file, got {path}")
@@ -169,7 +182,8 @@ def load_body_models(path: str | Path | None, genders: Sequence[str]) -> tuple[B
 
     Args:
         path: None takes the embedded bodies. A folder gives each gender from `SMPL_FEMALE.pkl`, `female.npz` or
-            the official `basicmodel_f_lbs_...pkl` in it (capitals do not matter). A file serves one gender.
+            the official `basicmodel_f_lbs_...pkl` in it (capitals do not matter), or in its `smpl`, `models` or
+            `smpl/models`. A file serves one gender.
         genders: Keys of `GENDERS`.
 
     Returns:
@@ -190,13 +204,13 @@ def load_body_models(path: str | Path | None, genders: Sequence[str]) -> tuple[B
         return tuple(load_body_model(path, gender) for gender in genders)
 
     def file_of(gender: str) -> Path:
-        bodies = (file for file in sorted(Path(path).iterdir()) if file.suffix.lower() in _READERS)
-        files = [file for file in bodies if _FILE_NAMES[gender].fullmatch(file.stem.lower())]
+        named = (_named_for(gender, Path(path) / folder) for folder in _FOLDERS)
+        files = next((each for each in named if each), [])
         if not files:
             raise FileNotFoundError(
-                f"path: no body of gender {gender} in {path}; expected SMPL_{gender.upper()}.pkl, {gender}.npz or the "
-                "official name (basicmodel_..._lbs_10_207_0_v1.1.0.pkl). Put it there, or leave the gender out "
-                "(body.genders)"
+                f"path (body.path): no body of gender {gender} in {path}; expected SMPL_{gender.upper()}.pkl, "
+                f"{gender}.npz or the official name (basicmodel_..._lbs_10_207_0_v1.1.0.pkl). Put it there, or leave "
+                f"the gender out (body.genders, body.predicted). {_OFFICIAL}"
             )
         if len(files) > 1:
             names = ", ".join(file.name for file in files)
@@ -206,7 +220,31 @@ def load_body_models(path: str | Path | None, genders: Sequence[str]) -> tuple[B
     return tuple(load_body_model(file_of(gender), gender) for gender in genders)
 
 
+def _named_for(gender: str, folder: Path) -> list[Path]:
+    """The files of a folder, which need not be there, that are named as bodies of a gender."""
+    files = sorted(folder.iterdir()) if folder.is_dir() else []
+    bodies = (file for file in files if file.suffix.lower() in _READERS)
+    return [file for file in bodies if _FILE_NAMES[gender].fullmatch(file.stem.lower())]
+
+
+def _check_family(arrays: Mapping[str, Any], path: Path) -> None:
+    """Raise a `ValueError` that names the model, if a file holds one of SMPL's relatives."""
+    shapes = {name: np.shape(arrays[name]) for name in _KEYS if name in arrays}
+    places = {"kintree_table": -1, "J_regressor": 0, "weights": -1}
+    numbers = {shapes[name][place] for name, place in places.items() if len(shapes.get(name, ())) == 2}
+    num_vertices = next(iter(shapes.get("v_template", ())), 0)
+    names = [_FAMILY[number] for number in sorted(numbers) if number in _FAMILY]
+    if num_vertices == _SMPLX_VERTICES:
+        names = [_FAMILY[55]]
+    if names:
+        raise ValueError(
+            f"{path}: this is a {names[0]} file ({max(numbers, default=0)} joints, {num_vertices} vertices); expected "
+            f"SMPL's {NUM_JOINTS} joints (and 6890 vertices). {_OFFICIAL}"
+        )
+
+
 def _assemble(arrays: Mapping[str, Any], gender: str, path: Path) -> BodyModel:
+    _check_family(arrays, path)
     if missing := ", ".join(key for key in _KEYS if key not in arrays):
         raise ValueError(f"{path}: should hold {', '.join(_KEYS)}; missing: {missing}. {_NOT_SMPL}")
     table = arrays["kintree_table"]
@@ -233,6 +271,11 @@ def _check_gender(gender: str) -> None:
         raise ValueError(f"gender: expected one of {', '.join(GENDERS)}, got {gender!r}")
 
 
+_OFFICIAL = (
+    f"The official SMPL files are at {_SMPL_HOME} (SMPL for Python, version 1.1.0), after registration: put "
+    "basicmodel_f_lbs_10_207_0_v1.1.0.pkl, basicmodel_m_... and basicmodel_neutral_... into one folder and name it "
+    "with body=smpl body.path=FOLDER."
+)
 _FILE_NAMES = {
     gender: re.compile(rf"(smpl_)?{gender}|basicmodel_{official}_.*")
     for gender, official in (("female", "f"), ("male", "m"), ("neutral", "neutral"))

@@ -31,8 +31,11 @@ def world_rotations(rotmat: Tensor) -> Tensor:
 
 
 def joint_positions(world: Tensor, offsets: Tensor) -> Tensor:
-    """Where joints are, `(n, 24, 3)`, metres, root at the origin; of `world_rotations` and `joint_offsets`."""
-    bones = (world[:, [max(parent, ROOT) for parent in PARENTS]] * offsets[:, None]).sum(-1)
+    """Where joints are, `(n, 24, 3)`, metres, root at the origin; of `world_rotations`, and offsets as `joint_offsets`.
+
+    Offsets are `(24, 3)`, or `(n, 24, 3)` of each.
+    """
+    bones = (world[:, [max(parent, ROOT) for parent in PARENTS]] * offsets[..., None, :]).sum(-1)
     joints = torch.zeros_like(bones)
     for level in LEVELS[1:]:
         children = list(level)

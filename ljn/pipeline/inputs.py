@@ -1,9 +1,9 @@
 """Reading what a user has: depth images, masks, cameras and keypoints."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from ljn.reading import READ_ERRORS, brief, read_arrays, read_json, read_yaml, r
 
 DEPTH_SUFFIXES = (".png", ".npy", ".npz")
 RGB_SUFFIXES = (".png", ".jpg", ".jpeg")
+_DEEP = ("I", "I;16", "I;16B", "F")  # those of more than 8 bits
 _GREY = ("1", "L", "I", "I;16", "I;16B", "F")  # Pillow's modes of one channel
 _CAMERA_KEYS = ("fx", "fy", "cx", "cy", "width", "height")
 
@@ -77,24 +78,56 @@ def read_rgb(path: str | Path) -> np.ndarray:
     path = _existing(path, "rgb")
     if path.suffix.lower() not in RGB_SUFFIXES:
         raise ValueError(f"rgb: expected one of {', '.join(RGB_SUFFIXES)}, got '{path}'")
-    image = _read_image(path, "rgb", ())
-    if image.dtype != np.uint8:
-        raise ValueError(f"rgb: expected 8 bits a channel, '{path}' has {image.dtype}: the depth image?")
+    image = _read_image(path, "rgb", _DEEP)
+    if image.dtype != np.uint8 or image.ndim != 3:
+        raise ValueError(
+            f"rgb: expected 8 bits a channel, red, green and blue; '{path}' has {image.dtype} and shape {image.shape}: "
+            "the depth image?"
+        )
     return image
 
 
 def read_camera(path: str | Path) -> Camera:
-    """A camera from YAML or JSON, pixels; pixel centres at integers.
+    """A camera without distortion from YAML or JSON, pixels; pixel centres at integers.
 
     Forms: fx, fy, cx, cy, width and height; ROS's `camera_info` and OpenCV's calibration files (`camera_matrix`, image
     width and height); Open3D's (`intrinsic_matrix`, column by column); RealSense's (`ppx`, `ppy`). Keys that begin with
-    `_` are passed over, so the files in `conf/data/camera` can be read. Cameras here have no distortion: coefficients
-    that are not all 0 are an error.
+    `_` are passed over, so the files in `conf/data/camera` can be read. Coefficients of a distortion that are not all 0
+    are an error.
 
     Raises:
         FileNotFoundError: There is no such file.
         ValueError: It cannot be read, keys are missing or unknown, a value is not what its key needs, or images of the
             camera are distorted.
+    """
+    found = read_camera_file(path)
+    if any(found.distortion):
+        raise ValueError(
+            f"camera: '{path}' has coefficients of a distortion that are not 0, and cameras here have no distortion: "
+            "undistort the images (cv2.undistort), and set them to 0"
+        )
+    return found.camera
+
+
+class CameraFile(NamedTuple):
+    """What a camera's file says."""
+
+    camera: Camera
+    distortion: list[float]  # OpenCV's coefficients; none or all 0 without distortion
+    model: str  # of the distortion, by the name that the file gives; empty where it gives none
+    others: dict[str, Any]  # further keys
+
+
+def read_camera_file(path: str | Path, others: Collection[str] | None = ()) -> CameraFile:
+    """A camera from any file that `read_camera` takes, with the coefficients of its distortion.
+
+    Args:
+        path: The file.
+        others: Further keys that it may have; None for any.
+
+    Raises:
+        FileNotFoundError: There is no such file.
+        ValueError: It cannot be read, keys are missing or unknown, or a value is not what its key needs.
     """
     path = _existing(path, "camera")
     try:
@@ -105,11 +138,20 @@ def read_camera(path: str | Path) -> Camera:
     if not isinstance(content, dict):
         raise ValueError(f"{expected}, got {shown(content)}")
     values = {str(key): value for key, value in content.items() if not str(key).startswith("_")}
-    values = _of_other_forms(values, path)
+    model = brief(str(next((values[key] for key in _MODELS if key in values), "")))
+    values = _of_other_forms({key: value for key, value in values.items() if key not in _MODELS}, path)
+    distortion: list[float] = []
+    for key in _DISTORTIONS:
+        if values.get(key) is not None:
+            distortion = _numbers_of(values[key], f"{key} in '{path}'")
+        values.pop(key, None)
     if missing := [key for key in _CAMERA_KEYS if key not in values]:
         raise ValueError(f"{expected}: {', '.join(missing)} are missing")
+    further = {
+        key: values.pop(key) for key in values.keys() - set(_CAMERA_KEYS) if others is None or key in others
+    }
     if unknown := sorted(values.keys() - set(_CAMERA_KEYS)):
-        problem = "are unknown (there is no distortion here: undistort the images)"
+        problem = f"are unknown (a distortion is given as {_DISTORTIONS[0]}: [k1, k2, p1, p2, k3])"
         raise ValueError(f"{expected}: {brief(', '.join(unknown))} {problem}")
     fx, fy, cx, cy, width, height = (_camera_number(values[key], key, path) for key in _CAMERA_KEYS)
     for key, size in (("width", width), ("height", height)):
@@ -117,18 +159,17 @@ def read_camera(path: str | Path) -> Camera:
             raise ValueError(
                 f"camera: {key}: expected a whole number of pixels in '{path}', got {size:g}; give the image's own size"
             )
-    return Camera(fx, fy, cx, cy, int(width), int(height))
+    return CameraFile(Camera(fx, fy, cx, cy, int(width), int(height)), distortion, model, further)
 
 
 _MATRICES = ("camera_matrix", "K", "k", "intrinsic_matrix")
 _DISTORTIONS = ("distortion_coefficients", "distortion", "dist_coeffs", "D", "d", "coeffs")
+_MODELS = ("distortion_model", "model")
 _RENAMED = {"ppx": "cx", "ppy": "cy", "image_width": "width", "image_height": "height"}
 _PASSED_OVER = (
     *(
         "header",
         "camera_name",
-        "distortion_model",
-        "model",
         "rectification_matrix",
         "projection_matrix",
         "R",
@@ -154,12 +195,6 @@ def _of_other_forms(values: dict[str, Any], path: Path) -> dict[str, Any]:
     if matrix is None and "ppx" not in values:
         return values
     values = {_RENAMED.get(key, key): value for key, value in values.items() if key not in _PASSED_OVER}
-    for key in _DISTORTIONS:
-        if key in values and any(_numbers_of(values.pop(key), f"{key} in '{path}'")):
-            raise ValueError(
-                f"camera: '{path}' has {key} that are not 0, and cameras here have no distortion: undistort the images "
-                "(cv2.undistort), and set them to 0"
-            )
     if matrix is not None:
         numbers = _numbers_of(values.pop(matrix), f"{matrix} in '{path}'")
         if len(numbers) != 9:

@@ -18,7 +18,7 @@ def tolerance_m(z: np.ndarray) -> np.ndarray:
 
 
 def rays(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """x / z of the columns `(1, W)` and y / z of the rows `(H, 1)`, float32."""
+    """X / z of the columns `(1, W)` and y / z of the rows `(H, 1)`, float32."""
     across = (np.arange(camera.width, dtype=np.float32) - np.float32(camera.cx)) / np.float32(camera.fx)
     down = (np.arange(camera.height, dtype=np.float32) - np.float32(camera.cy)) / np.float32(camera.fy)
     return across[None], down[:, None]

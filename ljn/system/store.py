@@ -44,7 +44,7 @@ class StoredFrame(NamedTuple):
         """The prediction, without cloud and mesh; None of a frame that failed."""
         if "joints" not in self.arrays:
             return None
-        arrays = {name: value for name, value in self.arrays.items() if name != "mask"}
+        arrays: dict[str, Any] = {name: value for name, value in self.arrays.items() if name != "mask"}
         return Prediction(points=np.zeros((0, 6), np.float32), **arrays)
 
 
@@ -141,9 +141,19 @@ class Store:
         """The pictures of the frames that are done, in order."""
         return sorted(self.pictures.glob("*.jpg"))[: self.num_done]
 
-    def read_pictures(self) -> Iterator[np.ndarray]:
-        """The pictures `(H, W, 3)` uint8 of the frames that are done, in order, one at a time."""
+    def read_pictures(self, number: int | None = None) -> Iterator[np.ndarray]:
+        """The pictures `(H, W, 3)` uint8 of the frames that are done, in order, one at a time.
+
+        Args:
+            number: So many of them, spread evenly; None: all.
+        """
         import cv2
 
-        for path in self.picture_files():
-            yield cv2.imread(str(path), cv2.IMREAD_COLOR)[..., ::-1]
+        paths = self.picture_files()
+        if number is not None and len(paths) > number:
+            paths = [paths[round(i * (len(paths) - 1) / (number - 1))] for i in range(number)]
+        for path in paths:
+            picture = cv2.imread(str(path), cv2.IMREAD_COLOR)
+            if picture is None:
+                raise ValueError(f"'{path}' is damaged; remove the folder, and give the same command again")
+            yield picture[..., ::-1]

@@ -165,7 +165,7 @@ class ArSystem:
                 "betas": torch.from_numpy(prediction.betas),
             }
         smoothed = self.smoother(values, seconds - last)
-        made = {"joints": smoothed["joints"].numpy()}
+        made: dict[str, Any] = {"joints": smoothed["joints"].numpy()}
         if self.pipeline.regressor is not None:
             device = self.pipeline.regressor.module.device
             parameters = [smoothed[name][None].to(device) for name in ("rotmats", "betas", "root")]

@@ -1,6 +1,6 @@
-"""Pictures as a video."""
+"""Pictures as a video, and some of them on a sheet."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from fractions import Fraction
 from pathlib import Path
 
@@ -56,3 +56,14 @@ def write_video(path: Path, pictures: Iterable[np.ndarray], fps: float) -> int:
         return count
     finally:
         draft.unlink(missing_ok=True)
+
+
+def contact_sheet(pictures: Sequence[np.ndarray], num_columns: int) -> np.ndarray:
+    """Pictures `(H, W, 3)` uint8 of one size side by side, in reading order: `(R * H, C * W, 3)`."""
+    height, width, _ = pictures[0].shape
+    num_rows = -(-len(pictures) // num_columns)
+    sheet = np.full((num_rows * height, min(num_columns, len(pictures)) * width, 3), 255, np.uint8)
+    for number, picture in enumerate(pictures):
+        row, column = divmod(number, num_columns)
+        sheet[row * height : (row + 1) * height, column * width : (column + 1) * width] = picture
+    return sheet

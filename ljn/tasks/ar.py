@@ -12,11 +12,13 @@ from typing import Any
 import numpy as np
 import torch
 from omegaconf import DictConfig, OmegaConf
+from PIL import Image
 from tqdm import tqdm
 
 from ljn.building import build
 from ljn.metrics import apve, mpjpe
 from ljn.pipeline.motion import WRITERS, PosedFrame, body_motion
+from ljn.pipeline.motion_glb import write_glb
 from ljn.pipeline.pipeline import Pipeline
 from ljn.refinement import chosen_settings
 from ljn.render import get_renderer
@@ -28,14 +30,21 @@ from ljn.system.smoothing import SmoothingSettings
 from ljn.system.store import Store
 from ljn.system.summary import page, summarise
 from ljn.system.system import ArResult, ArSystem
-from ljn.system.video import write_video
+from ljn.system.video import contact_sheet, write_video
 from ljn.system.view import WebView
 from ljn.tasks.package import chosen_package
 from ljn.tasks.validation import check_writable
 
 _LOG = logging.getLogger(__name__)
 _FPS = 30.0  # of videos of recordings whose rate nobody knows
-_VIDEO, _MOTION, _SUMMARY, _PAGE = "overlay.mp4", "motion", "summary.json", "index.html"
+_VIDEO, _SHEET, _MOTION, _SUMMARY, _PAGE = (
+    "overlay.mp4",
+    "overview.jpg",
+    "motion",
+    "summary.json",
+    "index.html",
+)
+_SHOWN, _COLUMNS = 8, 4  # frames of the overview
 _COMMAND = "python run.py task=ar input=RECORDING"
 
 
@@ -43,8 +52,9 @@ def ar(cfg: DictConfig) -> dict[str, float]:
     """Run the AR system over a recording, into `output_dir/ar/NAME-HASH`.
 
     A frame that fails is marked, and the others go on. Each frame leaves its arrays (`frames/`) and a picture
-    (`pictures/`); all together leave a video, the motion in AMASS's form and as BVH, `summary.json` and a page,
-    `index.html`. A call that is cut off leaves these of the frames that it has done, and the same call goes on.
+    (`pictures/`); all together leave a video, an overview, the motion in AMASS's form, as BVH and as an animated mesh
+    (`.glb`), `summary.json` and a page, `index.html`. A call that is cut off leaves these of the frames that it has
+    done, and the same call goes on.
 
     Args:
         cfg: The composed configuration; of it `task`, `recording`, `segmentation`, `ckpt_path`, `weights`, `refine`,
@@ -89,7 +99,7 @@ def ar(cfg: DictConfig) -> dict[str, float]:
     if not summary["predicted"]:
         reasons = "; ".join(list(summary["errors"])[:3])
         raise ValueError(f"input: none of {summary['frames']} frames could be predicted: {reasons}")
-    metrics = {
+    metrics: dict[str, float] = {
         name: float(summary[name])
         for name in ("frames", "failed", "iou", "mpjpe_mm", "apve_mm")
         if name in summary
@@ -217,12 +227,16 @@ def _finish(
     summary = summarise(frames)
     fps = recording.fps or _FPS
     write_video(store.directory / _VIDEO, store.read_pictures(), fps)
+    if pictures := list(store.read_pictures(_SHOWN)):
+        Image.fromarray(contact_sheet(pictures, _COLUMNS)).save(store.directory / _SHEET, quality=90)
     if pipeline.regressor is not None and any(frame is not None for frame in posed):
         motion = body_motion(posed, pipeline.regressor.module.body, fps)
         for suffix, write in WRITERS.values():
             write(store.directory / f"{_MOTION}{suffix}", motion)
+        write_glb(store.directory / f"{_MOTION}.glb", motion, pipeline.regressor.module.body)
     write_json(store.directory / _SUMMARY, {**summary, "settings": settings, "per_frame": frames})
-    made = [_VIDEO, *(f"{_MOTION}{suffix}" for suffix, _ in WRITERS.values()), _SUMMARY]
+    motions = [f"{_MOTION}{suffix}" for suffix, _ in WRITERS.values()]
+    made = [_VIDEO, _SHEET, *motions, f"{_MOTION}.glb", _SUMMARY]
     files = [name for name in made if (store.directory / name).is_file()]
     if frames:
         write_text_atomically(store.directory / _PAGE, page(recording.name, summary, frames, files))

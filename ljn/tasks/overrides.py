@@ -17,8 +17,8 @@ _OF_BODY = {
     "body.predicted": ("module.predicted",),
 }
 _MISSING = object()
-_WHOLE = {"data/sensor=": ("data.sensor",), "data/source=": ("data.source", "data.synthesis.heading")}
-"""Groups that an evaluation may choose as a whole, and the keys that they set."""
+_WHOLE = {"data/sensor=": "data.sensor", "data/source=": "data.source"}
+"""Groups that an evaluation may choose as a whole, and the key that each sets."""
 
 
 def typed_overrides() -> list[str]:
@@ -40,11 +40,9 @@ def with_checkpoint_config(cfg: DictConfig, checkpoint: Checkpoint, overrides: l
     plain |= {name: _with_call(checkpoint.config[name], plain[name], name) for name in CONFIG_GROUPS}
     merged = OmegaConf.create(plain)
     OmegaConf.set_struct(merged, True)
-    for start, keys in _WHOLE.items():
+    for start, key in _WHOLE.items():
         if any(line.startswith(start) for line in overrides):
-            for key in keys:
-                chosen = OmegaConf.select(cfg, key)
-                OmegaConf.update(merged, key, chosen, merge=False, force_add=True)
+            OmegaConf.update(merged, key, OmegaConf.select(cfg, key), merge=False, force_add=True)
     apply_overrides(merged, [line for line in overrides if not line.startswith(tuple(_WHOLE))])
     return merged
 

@@ -503,3 +503,63 @@ def test_a_body_in_another_unit_or_with_z_up_is_refused(change, message, tmp_pat
     np.savez(tmp_path / "body.npz", **{**fields, "v_template": change(fields["v_template"].astype(float))})
     with pytest.raises(ValueError, match=message):
         load_body_model(tmp_path / "body.npz")
+
+
+# The official files, and SMPL's relatives
+
+
+@pytest.mark.parametrize(
+    ("folder", "names"),
+    [
+        ("", ("basicModel_f_lbs_10_207_0_v1.0.0", "basicmodel_m_lbs_10_207_0_v1.0.0")),
+        ("smpl/models", ("basicmodel_f_lbs_10_207_0_v1.1.0", "basicmodel_m_lbs_10_207_0_v1.1.0")),
+        (
+            "SMPL_python_v.1.1.0/smpl/models",
+            ("basicmodel_f_lbs_10_207_0_v1.1.0", "basicmodel_m_lbs_10_207_0_v1.1.0"),
+        ),
+        ("smpl", ("SMPL_FEMALE", "SMPL_MALE")),
+    ],
+)
+def test_official_archives_are_found_as_they_unpack(folder, names, tmp_path):
+    (tmp_path / folder).mkdir(parents=True, exist_ok=True)
+    (tmp_path / "smplh").mkdir()
+    (tmp_path / "smplh" / "SMPLH_FEMALE.npz").touch()
+    for name in names:
+        write(tmp_path / folder / f"{name}.pkl", smpl_fields())
+    female, male = load_body_models(tmp_path, ["female", "male"])
+    assert (female.path.stem, male.path.stem) == names
+    with pytest.raises(
+        FileNotFoundError, match=r"no body of gender neutral .*basicmodel_neutral_.*into one folder"
+    ):
+        load_body_models(tmp_path, ["neutral"])
+
+
+def test_without_the_official_files_it_is_said_where_they_are_and_where_to_put_them(tmp_path):
+    with pytest.raises(FileNotFoundError) as caught:
+        load_body_models(tmp_path / "smpl", ["female", "male"])
+    for words in (
+        "body.path",
+        "smpl.is.tue.mpg.de",
+        "registration",
+        "body=smpl body.path=FOLDER",
+        "embedded",
+    ):
+        assert words in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("joints", "vertices", "name"),
+    [(52, 6890, r"SMPL\+H"), (55, 10475, "SMPL-X"), (16, 778, "MANO"), (5, 5023, "FLAME")],
+)
+@pytest.mark.parametrize("suffix", [".npz", ".pkl"])
+def test_relatives_of_smpl_are_named(joints, vertices, name, suffix, tmp_path):
+    fields = {
+        "v_template": np.zeros((vertices, 3)),
+        "kintree_table": np.zeros((2, joints), np.int64),
+        "J_regressor": np.zeros((joints, vertices)),
+        "hands_componentsl": np.zeros((45, 45)),
+    }
+    write(tmp_path / f"body{suffix}", fields)
+    message = rf"this is a {name} file \({joints} joints, {vertices} vertices\); expected SMPL's 24 joints"
+    with pytest.raises(ValueError, match=message):
+        load_body_model(tmp_path / f"body{suffix}")

@@ -56,7 +56,10 @@ def test_all_else_is_left_alone():
 def test_a_key_that_has_moved_is_named(run_py):
     done = run_py("input=depth.png", check=False)
     assert done.returncode == 1
-    assert done.stderr == "error: input: only task=predict reads this; add task=predict, or leave it out\n"
+    assert (
+        done.stderr
+        == "error: input: only task=predict and task=ar read this; add task=predict, or leave it out\n"
+    )
     assert prepare_arguments(["task=predict", "input=a=b.png"]) == ["task=predict", "task.input='a=b.png'"]
 
 
@@ -65,6 +68,6 @@ def test_a_key_of_several_tasks_is_short_in_each():
         assert prepare_arguments([task, "mesh_ckpt_path=a=b"]) == [task, "task.mesh_ckpt_path='a=b'"]
     with pytest.raises(
         ValueError,
-        match="mesh_ckpt_path: only task=predict, task=demo, task=package and task=benchmark read this",
+        match="mesh_ckpt_path: only task=predict, task=ar, task=demo, task=package and task=benchmark read this",
     ):
         prepare_arguments(["task=train", "mesh_ckpt_path=x"])

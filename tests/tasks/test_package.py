@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from ljn import Pipeline
 from ljn.body import load_body_model
@@ -230,3 +231,49 @@ def test_an_installed_wheel_predicts_by_name_without_a_checkout(both, tmp_path):
         text=True,
     )
     assert done.stdout.strip() == "(6890, 3)", done.stderr
+
+
+def test_a_keypoint_detector_is_a_package_of_its_own_and_finds_keypoints_in_predictions(
+    models, write_checkpoint, smoke_config, image, tmp_path
+):
+    ckpt = write_checkpoint("keypoints/cpn_depth")
+    given = [f"task.keypoint_detector={ckpt}", f"task.directory={tmp_path}", "task.name=cpn"]
+    cfg = smoke_config(tmp_path, "task=package", *given, "task.licence=CC0-1.0", "task.precision=half")
+    assert package(cfg)["package/keypoints_rounding"] < 0.1
+    path = tmp_path / "cpn.safetensors"
+    assert list(said(path)["stages"]) == ["keypoints"]
+    checkpoints = [f"ckpt_path={models[0]}", f"task.mesh_ckpt_path={models[1]}"]
+    made = {}
+    for detector in (ckpt, path):
+        cfg = smoke_config(
+            tmp_path, "task=predict", *image[1], *checkpoints, f"task.keypoint_detector={detector}"
+        )
+        predict(cfg)
+        (found,) = (tmp_path / "predictions").glob("*/depth.npz")
+        made[detector] = np.load(found)["keypoints"]
+        summary = json.loads((found.parent / "predictions.json").read_text())
+        assert summary["keypoint_detector"]["path"] == str(detector)
+        assert summary["frames"]["depth"]["keypoints_found_in"] == "depth"
+    assert np.median(np.abs(made[ckpt] - made[path])) < 2  # half precision
+    with pytest.raises(
+        ValueError, match=r"a package holds a keypoint detector or the two other stages, got both"
+    ):
+        package(smoke_config(tmp_path, "task=package", *given, *checkpoints, "task.licence=CC0-1.0"))
+
+
+def test_a_keypoint_detector_of_colours_needs_the_colour_image(
+    models, write_checkpoint, smoke_config, image, tmp_path
+):
+    ckpt = write_checkpoint("keypoints/cpn")
+    given = [*image[1], f"ckpt_path={models[0]}", f"task.keypoint_detector={ckpt}"]
+    with pytest.raises(ValueError, match=r"task.rgb: expected a path, since the keypoint detector"):
+        predict(smoke_config(tmp_path, "task=predict", *given))
+    rgb = np.random.default_rng(0).integers(0, 256, (*image[0].shape, 3), dtype=np.uint8)
+    Image.fromarray(rgb).save(tmp_path / "colours.jpg")
+    predict(smoke_config(tmp_path, "task=predict", *given, f"task.rgb={tmp_path / 'colours.jpg'}"))
+    (summary,) = (tmp_path / "predictions").glob("*/predictions.json")
+    assert json.loads(summary.read_text())["frames"]["depth"]["keypoints_found_in"] == "rgb"
+    Image.fromarray((1000 * image[0]).astype(np.uint16)).save(tmp_path / "deep.png")
+    for name, problem in (("depth.npy", "expected one of .png"), ("deep.png", "expected 8 bits a channel")):
+        with pytest.raises(ValueError, match=f"rgb: {problem}"):
+            predict(smoke_config(tmp_path, "task=predict", *given, f"task.rgb={tmp_path / name}"))

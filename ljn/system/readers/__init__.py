@@ -1,0 +1,46 @@
+"""Recordings of depth cameras in files, and cameras that record now, behind one interface."""
+
+from pathlib import Path
+
+from ljn.system.readers import folder, tum
+from ljn.system.readers.cameras import LensCamera
+from ljn.system.readers.files import CameraLike
+from ljn.system.readers.recorder import Recorder
+from ljn.system.recording import Recording
+
+__all__ = ["LensCamera", "Recorder", "open_recording"]
+
+_LAYOUTS = (
+    (tum.is_tum, tum.open_tum, tum.LOOKS_FOR),
+    (folder.is_folder, folder.open_folder, folder.LOOKS_FOR),
+)
+
+
+def open_recording(
+    path: str | Path,
+    camera: CameraLike | None = None,
+    rgb_camera: CameraLike | None = None,
+    depth_scale: float | None = None,
+) -> Recording:
+    """A recording, whose layout is recognised by what is there.
+
+    Args:
+        path: Its folder.
+        camera: The depth camera, or its file; None for that in the folder.
+        rgb_camera: The colour camera, or its file; None for that in the folder, or for colours that are registered to
+            the depth images already, pixel by pixel.
+        depth_scale: Units of integer depth images to a metre; None for what the layout says: 5000 in TUM's, otherwise
+            1000, millimetres.
+
+    Raises:
+        FileNotFoundError: There is no such folder, no images in it, or no camera file.
+        ValueError: It has no layout that is known, files cannot be read, or images and cameras do not fit each other.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise FileNotFoundError(f"input: no folder '{path}'")
+    for is_layout, open_layout, _ in _LAYOUTS:
+        if path.is_dir() and is_layout(path):
+            return open_layout(path, camera, rgb_camera, depth_scale)
+    sought = "; or ".join(text for _, _, text in _LAYOUTS)
+    raise ValueError(f"input: '{path}' is no recording: looked for {sought}")
