@@ -7,6 +7,7 @@ import numpy as np
 from ljn.geometry.camera import Camera
 from ljn.pipeline.person import find_person
 from ljn.pipeline.report import Report
+from ljn.pipeline.scene import find_in_scene
 
 _FARTHEST_M = 20.0  # no depth camera sees a person farther away
 _NEAREST_MM = 100.0
@@ -60,7 +61,9 @@ def body_depth(depth: Any, camera: Camera, mask: Any = None, report: Report | No
             f"depth: all pixels are 0, or no depth ({np.count_nonzero(depth)} are negative, NaN, infinite or a "
             "code for nothing): nothing was measured; is the file or the stream the right one?"
         )
-    person = find_person(metres, camera)
+    seen_m2 = float(np.square(metres, dtype=np.float64).sum()) / (camera.fx * camera.fy)
+    is_scene = mask is None and seen_m2 > AREA_M2[1]
+    person = find_in_scene(metres, camera, report) if is_scene else find_person(metres, camera)
     num_pixels = int(np.count_nonzero(person.depth))
     report.note(
         pixels=num_pixels,
@@ -71,7 +74,7 @@ def body_depth(depth: Any, camera: Camera, mask: Any = None, report: Report | No
             "flying": person.num_flying,
         },
     )
-    num_dropped = person.num_foreign + person.num_rim + person.num_flying
+    num_dropped = 0 if is_scene else person.num_foreign + person.num_rim + person.num_flying
     _check_size(person.depth, person.area_m2, camera, mask is not None, report)
     if person.apart_m2 > APART_M2:
         report.doubt(
