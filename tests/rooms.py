@@ -120,13 +120,13 @@ class Scene(NamedTuple):
     labels: tuple[str, ...]
 
 
-def body_in_room(vertices: np.ndarray, at: tuple[float, float], heading: float, lift_m: float = 0.0) -> np.ndarray:
+def body_in_room(vertices: np.ndarray, at: tuple[float, float], heading: float) -> np.ndarray:
     """A body `(V, 3)` of the body world (z up, x forward) on the floor of a room, its box's middle at x, z."""
     turned = vertices @ rotation_about("z", torch.tensor(heading, dtype=torch.float64)).numpy().T
     points = turned @ CAMERA_FROM_BODY.numpy().T * [1.0, -1, 1]  # y up
     low, high = points.min(0), points.max(0)
     middle = (low + high) / 2
-    return points + [at[0] - middle[0], lift_m - low[1], at[1] - middle[2]]
+    return points + [at[0] - middle[0], -low[1], at[1] - middle[2]]
 
 
 def render(vertices: np.ndarray, faces: torch.Tensor, room: Room, camera: Camera) -> np.ndarray:
@@ -142,11 +142,10 @@ def scenes(number: int, split: str = "test", seed: int = 0) -> Iterator[Scene]:
     bodies = [SMPL(load_body_models(None, [gender])) for gender in source.genders]
     chains = {name: _sensor(name) for name in SENSORS}
     records = source.records(split, 2 * number, seed)
-    codes = {0: 0, 1: 1}
 
     def body_of(row: int) -> np.ndarray:
         pose = torch.from_numpy(records.pose[row])
-        body = bodies[codes[int(records.gender[row])]]
+        body = bodies[int(records.gender[row])]
         return body(pose, torch.from_numpy(records.betas[row])).vertices.numpy().astype(np.float64)
 
     faces = bodies[0].faces
@@ -196,7 +195,6 @@ def _furnished(
     labels: list[str] = []
     distance = rng.uniform(1.8, 3.6)
     at = (rng.uniform(-0.25, 0.25) * distance, distance)
-    lift = 0.45 * rng.random() if family == "sit" and rng.random() < 0.5 else 0.0
     vertices = body_in_room(body, at, rng.uniform(-np.pi, np.pi))
     low, high = vertices.min(0), vertices.max(0)
     behind = high[2] + (rng.uniform(0.03, 0.3) if rng.random() < 0.2 else rng.uniform(0.3, 2.5))
@@ -208,7 +206,6 @@ def _furnished(
         roll=rng.normal(0, 0.03),
         ceiling_m=rng.uniform(2.4, 3.0),
     )
-    del lift
     if family == "sit" and rng.random() < 0.7:
         # A stool, or a chair, below.
         hips = body_hips(vertices)

@@ -1,5 +1,6 @@
 """The person in a depth image of a whole room: floor, walls and other large planes are taken away."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -18,20 +19,26 @@ _HYPOTHESES, _POINTS, _REACH = 400, 2500, 0.2
 image; and the points that they are tried on."""
 _COSINE = np.cos(np.deg2rad(30))
 """Between the normal of a plane and that of a point on it, at least."""
-_PLANE_M2, _MOST_PLANES = 0.35, 12
-"""No part of a person as large as this is plane."""
+_PLANE_M2, _MOST_PLANES = (0.35, 0.2), 12
+"""Hardly a part of a person as large as this is plane; the second where the first leaves things too large."""
 _FACET_M2 = 0.02
 """The least plane that counts in a figure's shape."""
-_NEAR_M = 0.2
+_NEAR_M = (0.2, 0.1)
 """In a room, pieces nearer than this belong together; on those of up to twice as far see `Person.beside_m2`."""
+_LARGE = np.array([0.95, 2.4, 1.6, 1.2, np.inf, np.inf])
+"""Of a figure's shape: more than this is no single person."""
 _BESIDE_M2 = 0.02
 """So much that may belong to the person, or not, is worth a warning."""
 _LEAST_M2, _MOST_FIGURES = 0.07, 8
-_TYPICAL = np.array([[0.36, 0.10], [1.37, 0.28], [0.65, 0.17], [0.38, 0.12], [0.42, 0.17], [0.21, 0.09]])
+_TYPICAL = np.array([[0.43, 0.14], [1.45, 0.28], [0.65, 0.17], [0.38, 0.12], [0.50, 0.17], [0.22, 0.09]])
 """Mean and standard deviation of what `_Figure.shape` holds, of rendered persons in rooms."""
-_STRANGE, _UNUSUAL, _AS_LIKELY = 40.0, 24.0, 28.0
-"""Sums of squared deviations from these: what is more than the first is no person, more than the second a doubtful one;
-another figure of less than the third may be the person."""
+_UNUSUAL, _AS_LIKELY, _STRANGE, _STRANGEST = 24.0, 28.0, 40.0, 70.0
+"""Sums of squared deviations from these: what is more than the first is doubted; another figure of less than the second
+may be the person; what is more than the third, or with a misfit to decide the fourth, is none."""
+_MISFITS_M = (0.055, 0.08, 0.15)
+"""The same of a misfit."""
+_MOST_JUDGED = 5
+_NO_MASK = "; give a mask of the person alone"
 
 
 class Planes(NamedTuple):
@@ -55,52 +62,59 @@ def tolerance_m(z: np.ndarray) -> np.ndarray:
     return 0.012 + 0.0025 * z**2
 
 
-def find_in_scene(metres: np.ndarray, camera: Camera, report: Report) -> Person:
-    """The person in a room: the figure whose size and shape are most like a person's once all planes are gone.
+Misfit = Callable[[np.ndarray], float]
+"""How far a depth image `(H, W)` lies from the body that is found in it, metres."""
+
+
+def find_in_scene(metres: np.ndarray, camera: Camera, report: Report, misfit: Misfit | None = None) -> Person:
+    """The person in a room: of what is left once all planes are gone, the figure that is most like a person.
 
     Args:
         metres: `(H, W)` float32, metres; 0 is nothing; something is there.
         camera: The camera of this image.
         report: Gets what was taken away, and a doubt where the choice is not clear.
+        misfit: Decides between figures whose size and shape are a person's; None: these alone do.
 
     Raises:
         ValueError: Nothing is like a person.
     """
     planes = find_planes(metres, camera)
-    left = np.where(planes.is_on, np.float32(0), metres)
-    figures = _figures(left, camera)
-    likely = sorted((figure for figure in figures if figure.strangeness < _STRANGE), key=lambda one: one.strangeness)
-    if not likely:
+    figures = _figures(np.where(planes.is_on, np.float32(0), metres), camera)
+    report.note(planes=len(planes.offsets), on_planes=int(np.count_nonzero(planes.is_on)), figures=len(figures))
+    figures = [figure for figure in figures if figure.strangeness < (_STRANGE if misfit is None else _STRANGEST)]
+    figures = sorted(figures, key=lambda figure: figure.strangeness)[:_MOST_JUDGED]
+    if misfit is None:
+        scores, limits = [figure.strangeness for figure in figures], (_UNUSUAL, _AS_LIKELY, _STRANGE)
+    else:
+        scores, limits = [misfit(figure.person.depth) for figure in figures], _MISFITS_M
+    best = int(np.argmin(scores)) if scores else -1
+    if best < 0 or scores[best] > limits[2]:
         raise ValueError(
             f"depth: without a mask, no person was found: {len(planes.offsets)} planes (floor, walls, furniture) were "
-            f"taken away, and of the {len(figures)} other things none has a person's size and shape; give a mask of "
-            "the person"
+            f"taken away, and nothing else has a person's size and shape{_NO_MASK}"
         )
-    first, *others = likely
-    report.note(planes=len(planes.offsets), figures=len(figures), on_planes=int(np.count_nonzero(planes.is_on)))
-    rivals = sum(other.strangeness < _AS_LIKELY for other in others)
-    ask = "give a mask of the person alone"
-    if rivals:
+    found = figures[best].person
+    if misfit is not None:
+        report.note(misfit_mm=round(1000 * scores[best], 1))
+    v, u = np.nonzero(found.depth)
+    place = f"at u = {np.median(u):.0f}, v = {np.median(v):.0f}, {np.median(found.depth[v, u]):.1f} m"
+    if num_rivals := sum(score < limits[1] for score in scores) - (scores[best] < limits[1]):
         report.doubt(
-            f"depth: without a mask, {1 + rivals} things have a person's size and shape; the likeliest was taken, at "
-            f"{_place(first.person.depth)}; {ask}"
+            f"depth: without a mask, {1 + num_rivals} things have a person's size and shape; the likeliest was taken, "
+            f"{place}{_NO_MASK}"
         )
-    elif first.strangeness > _UNUSUAL:
+    elif scores[best] > limits[0]:
+        report.doubt(f"depth: without a mask, what was taken, {place}, is hardly like a person{_NO_MASK}")
+    if figures[best].is_parted:
         report.doubt(
-            f"depth: without a mask, something of an unusual size or shape for a person was taken, at "
-            f"{_place(first.person.depth)}; {ask}"
+            f"depth: without a mask, the person, {place}, had to be cut out of what it touches{_NO_MASK}"
         )
-    if first.person.beside_m2 > _BESIDE_M2:
+    elif found.beside_m2 > _BESIDE_M2:
         report.doubt(
-            f"depth: without a mask, {first.person.beside_m2:.2f} square metres beside the person may be a part of it "
-            f"and were left out; {ask}"
+            f"depth: without a mask, {found.beside_m2:.2f} square metres beside the person may be a part of it and "
+            f"were left out{_NO_MASK}"
         )
-    return first.person
-
-
-def _place(depth: np.ndarray) -> str:
-    v, u = np.nonzero(depth)
-    return f"u = {np.median(u):.0f}, v = {np.median(v):.0f}, {np.median(depth[v, u]):.1f} m"
+    return found
 
 
 class _Figure(NamedTuple):
@@ -110,10 +124,12 @@ class _Figure(NamedTuple):
         person: Its pixels.
         shape: `(6,)`: area, its three extents along its own axes, longest first (metres), the share of its area that is
             plane, and that of the largest of these planes.
+        is_parted: Whether it was parted from something too large, and may have lost a part to it.
     """
 
     person: Person
     shape: np.ndarray
+    is_parted: bool
 
     @property
     def strangeness(self) -> float:
@@ -121,17 +137,22 @@ class _Figure(NamedTuple):
         return float((((self.shape - _TYPICAL[:, 0]) / _TYPICAL[:, 1]) ** 2).sum())
 
 
-def _figures(left: np.ndarray, camera: Camera) -> list[_Figure]:
-    """The larger things that are apart from each other, of what planes have left."""
+def _figures(left: np.ndarray, camera: Camera, level: int = 0) -> list[_Figure]:
+    """The larger things that are apart from each other, of what planes have left; what is too large is parted again."""
     figures = []
     for _ in range(_MOST_FIGURES):
         if not left.any():
             break
-        found = find_person(left, camera, _NEAR_M)
+        found = find_person(left, camera, _NEAR_M[level])
         if found.area_m2 < _LEAST_M2:
             break
         left = np.where(found.depth > 0, np.float32(0), left)
-        figures.append(_Figure(found, _shape(found, camera)))
+        figure = _Figure(found, _shape(found, camera), level > 0)
+        if level + 1 < len(_NEAR_M) and (figure.shape > _LARGE).any():
+            facets = find_planes(found.depth, camera, _PLANE_M2[level + 1])
+            figures += _figures(np.where(facets.is_on, np.float32(0), found.depth), camera, level + 1)
+        else:
+            figures.append(figure)
     return figures
 
 
@@ -146,7 +167,7 @@ def _shape(found: Person, camera: Camera) -> np.ndarray:
     return np.array([found.area_m2, *extents, facets.sum(), facets.max(initial=0)])
 
 
-def find_planes(metres: np.ndarray, camera: Camera, least_m2: float = _PLANE_M2) -> Planes:
+def find_planes(metres: np.ndarray, camera: Camera, least_m2: float = _PLANE_M2[0]) -> Planes:
     """The planes of a depth image that are large enough, the largest first.
 
     Args:
@@ -160,7 +181,7 @@ def find_planes(metres: np.ndarray, camera: Camera, least_m2: float = _PLANE_M2)
     v, u = np.nonzero(small)
     points, pixels = _points(small, of_small, u, v), np.stack([u, v], -1)
     cloud = Cloud(points.astype(np.float32), pixels)
-    surface = _Surface(points, window_normals(cloud, small, of_small, 2, 0.25).astype(np.float64))
+    surface = _Surface(points, window_normals(cloud, small, of_small, 3, 0.25).astype(np.float64))
     area = points[:, 2] ** 2 / (of_small.fx * of_small.fy)
     rng = np.random.default_rng(0)  # equal images have equal planes
     tried = _hypotheses(points, pixels, small.shape, rng)
