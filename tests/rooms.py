@@ -224,7 +224,11 @@ def _furnished(
         width = np.ptp(other[:, 0]) / 2
         x = high[0] + away + width if side > 0 else low[0] - away - width
         other += [x, 0, at[1] + rng.uniform(-0.6, 1.0)]
-        room.walls = (min(room.walls[0], x - 1), max(room.walls[1], x + 1), max(behind, other[:, 2].max() + 0.2))
+        room.walls = (
+            min(room.walls[0], x - 1),
+            max(room.walls[1], x + 1),
+            max(behind, other[:, 2].max() + 0.2),
+        )
         labels.append("two people")
     elif rng.random() < 0.08:
         labels.append("no person")

@@ -29,6 +29,8 @@ _LARGE = np.array([0.95, 2.4, 1.6, 1.2, np.inf, np.inf])
 """Of a figure's shape: more than this is no single person."""
 _BESIDE_M2 = 0.02
 """So much that may belong to the person, or not, is worth a warning."""
+_CUT_M = 1.5
+"""Two feet, or a hand and two feet, touch floor and walls along less than this."""
 _LEAST_M2, _MOST_FIGURES = 0.07, 8
 _TYPICAL = np.array([[0.43, 0.14], [1.45, 0.28], [0.65, 0.17], [0.38, 0.12], [0.50, 0.17], [0.22, 0.09]])
 """Mean and standard deviation of what `_Figure.shape` holds, of rendered persons in rooms."""
@@ -79,9 +81,13 @@ def find_in_scene(metres: np.ndarray, camera: Camera, report: Report, misfit: Mi
         ValueError: Nothing is like a person.
     """
     planes = find_planes(metres, camera)
-    figures = _figures(np.where(planes.is_on, np.float32(0), metres), camera)
-    report.note(planes=len(planes.offsets), on_planes=int(np.count_nonzero(planes.is_on)), figures=len(figures))
-    figures = [figure for figure in figures if figure.strangeness < (_STRANGE if misfit is None else _STRANGEST)]
+    figures = _figures(metres, planes.is_on, camera)
+    report.note(
+        planes=len(planes.offsets), on_planes=int(np.count_nonzero(planes.is_on)), figures=len(figures)
+    )
+    figures = [
+        figure for figure in figures if figure.strangeness < (_STRANGE if misfit is None else _STRANGEST)
+    ]
     figures = sorted(figures, key=lambda figure: figure.strangeness)[:_MOST_JUDGED]
     if misfit is None:
         scores, limits = [figure.strangeness for figure in figures], (_UNUSUAL, _AS_LIKELY, _STRANGE)
@@ -105,9 +111,10 @@ def find_in_scene(metres: np.ndarray, camera: Camera, report: Report, misfit: Mi
         )
     elif scores[best] > limits[0]:
         report.doubt(f"depth: without a mask, what was taken, {place}, is hardly like a person{_NO_MASK}")
-    if figures[best].is_parted:
+    if figures[best].cut_m > _CUT_M:
         report.doubt(
-            f"depth: without a mask, the person, {place}, had to be cut out of what it touches{_NO_MASK}"
+            f"depth: without a mask, the person, {place}, had to be cut out of what it touches: a part of it may be lost"
+            f"{_NO_MASK}"
         )
     elif found.beside_m2 > _BESIDE_M2:
         report.doubt(
@@ -124,12 +131,12 @@ class _Figure(NamedTuple):
         person: Its pixels.
         shape: `(6,)`: area, its three extents along its own axes, longest first (metres), the share of its area that is
             plane, and that of the largest of these planes.
-        is_parted: Whether it was parted from something too large, and may have lost a part to it.
+        cut_m: Length of its outline where it was cut from a plane, and no jump of the depth parts them.
     """
 
     person: Person
     shape: np.ndarray
-    is_parted: bool
+    cut_m: float
 
     @property
     def strangeness(self) -> float:
@@ -137,23 +144,38 @@ class _Figure(NamedTuple):
         return float((((self.shape - _TYPICAL[:, 0]) / _TYPICAL[:, 1]) ** 2).sum())
 
 
-def _figures(left: np.ndarray, camera: Camera, level: int = 0) -> list[_Figure]:
-    """The larger things that are apart from each other, of what planes have left; what is too large is parted again."""
+def _figures(metres: np.ndarray, is_on: np.ndarray, camera: Camera, level: int = 0) -> list[_Figure]:
+    """The larger things that are apart from each other, without planes `(H, W)`; what is too large is parted again."""
     figures = []
+    left = np.where(is_on, np.float32(0), metres)
     for _ in range(_MOST_FIGURES):
         if not left.any():
             break
         found = find_person(left, camera, _NEAR_M[level])
         if found.area_m2 < _LEAST_M2:
             break
-        left = np.where(found.depth > 0, np.float32(0), left)
-        figure = _Figure(found, _shape(found, camera), level > 0)
-        if level + 1 < len(_NEAR_M) and (figure.shape > _LARGE).any():
+        is_found = found.depth > 0
+        left = np.where(is_found, np.float32(0), left)
+        shape = _shape(found, camera)
+        if level + 1 < len(_NEAR_M) and (shape > _LARGE).any():
             facets = find_planes(found.depth, camera, _PLANE_M2[level + 1])
-            figures += _figures(np.where(facets.is_on, np.float32(0), found.depth), camera, level + 1)
+            around = np.where(is_found | is_on, metres, np.float32(0))
+            figures += _figures(around, is_on | facets.is_on, camera, level + 1)
         else:
-            figures.append(figure)
+            figures.append(_Figure(found, shape, _cut_m(metres, is_found, is_on, camera)))
     return figures
+
+
+def _cut_m(metres: np.ndarray, is_found: np.ndarray, is_on: np.ndarray, camera: Camera) -> float:
+    length = 0.0
+    for axis, focal in ((0, camera.fy), (1, camera.fx)):
+        before, after = ([slice(None)] * 2 for _ in range(2))
+        before[axis], after[axis] = slice(None, -1), slice(1, None)
+        first, second = tuple(before), tuple(after)
+        is_cut = (is_found[first] & is_on[second]) | (is_found[second] & is_on[first])
+        z = metres[first]
+        length += float(z[is_cut & (np.abs(metres[second] - z) < 0.03 + 0.01 * z)].sum()) / focal
+    return length
 
 
 def _shape(found: Person, camera: Camera) -> np.ndarray:
@@ -177,7 +199,9 @@ def find_planes(metres: np.ndarray, camera: Camera, least_m2: float = _PLANE_M2[
     """
     step = max(1, round(max(metres.shape) / _SIDE_PX))
     small = np.ascontiguousarray(metres[::step, ::step])
-    of_small = Camera(camera.fx / step, camera.fy / step, camera.cx / step, camera.cy / step, *small.shape[::-1])
+    of_small = Camera(
+        camera.fx / step, camera.fy / step, camera.cx / step, camera.cy / step, *small.shape[::-1]
+    )
     v, u = np.nonzero(small)
     points, pixels = _points(small, of_small, u, v), np.stack([u, v], -1)
     cloud = Cloud(points.astype(np.float32), pixels)
@@ -254,7 +278,9 @@ def _hypotheses(
     return normals * sign[:, None], offsets * sign
 
 
-def _fitted(surface: _Surface, is_left: np.ndarray, normal: np.ndarray, offset: float) -> tuple[np.ndarray, float]:
+def _fitted(
+    surface: _Surface, is_left: np.ndarray, normal: np.ndarray, offset: float
+) -> tuple[np.ndarray, float]:
     """A plane fitted anew to the points on it, thrice."""
     for _ in range(3):
         on = is_left & surface.is_on(normal[None], np.array([offset]))[:, 0]

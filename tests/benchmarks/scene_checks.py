@@ -26,11 +26,18 @@ def measure(number: int, split: str) -> None:
         milliseconds.append(1000 * (time.thread_time() - start))
         for label in ("all", *scene.labels):
             outcomes[label][outcome] += 1
-    print("| | scenes | found, % | found, doubted | refused | wrong, doubted | wrong, taken |\n|---|" + 6 * "---:|")
+    print(
+        "| | scenes | found, % | found, doubted | refused | wrong, doubted | wrong, taken |\n|---|"
+        + 6 * "---:|"
+    )
     kinds = ("found", "found, doubted", "refused", "wrong, doubted", "wrong")
     for label, counts in outcomes.items():
         total = counts.total()
-        print(f"| {label} | {total} | " + " | ".join(f"{100 * counts[kind] / total:.1f}" for kind in kinds) + " |")
+        print(
+            f"| {label} | {total} | "
+            + " | ".join(f"{100 * counts[kind] / total:.1f}" for kind in kinds)
+            + " |"
+        )
     print(f"\n{np.median(milliseconds):.0f} ms of one core in the median, {np.max(milliseconds):.0f} at most")
 
 
