@@ -2,13 +2,14 @@
 
 python -m tests.benchmarks.input_checks --keypoints [--samples 2000]
 python -m tests.benchmarks.input_checks --depth [--samples 2000]
+python -m tests.benchmarks.input_checks --scenes [--samples 600]      whole rooms, without a mask
 
 Samples are embedded test poses of all families, seen from all sides by all sensors.
 """
 
 import argparse
 
-from tests.benchmarks import depth_checks, keypoint_checks
+from tests.benchmarks import depth_checks, keypoint_checks, scene_checks
 
 
 def main() -> None:
@@ -16,15 +17,18 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0] if __doc__ else None)
     parser.add_argument("--keypoints", action="store_true", help="2D keypoints held against the body")
     parser.add_argument("--depth", action="store_true", help="the person found in a depth image")
+    parser.add_argument("--scenes", action="store_true", help="the person found in a room, without a mask")
     parser.add_argument("--samples", type=int, default=2000)
     parser.add_argument("--split", default="test", help="train, where thresholds are chosen, or test")
     arguments = parser.parse_args()
-    if not (arguments.keypoints or arguments.depth):
-        parser.error("say what to measure: --keypoints, --depth")
+    if not (arguments.keypoints or arguments.depth or arguments.scenes):
+        parser.error("say what to measure: --keypoints, --depth, --scenes")
     if arguments.keypoints:
         keypoint_checks.measure(arguments.samples, arguments.split)
     if arguments.depth:
         depth_checks.measure(arguments.samples, arguments.split)
+    if arguments.scenes:
+        scene_checks.measure(arguments.samples, arguments.split)
 
 
 if __name__ == "__main__":
