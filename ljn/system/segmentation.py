@@ -96,7 +96,13 @@ class GreenCurtain:
             is_floor = is_before & (np.abs(heights) < tolerance)
             is_before &= heights > tolerance
         self.facts["has_floor"] = floor is not None
-        person = one_person(np.where(is_before, depth, np.float32(0)), camera)
+        try:
+            person = one_person(np.where(is_before, depth, np.float32(0)), camera)
+        except ValueError as error:
+            where = "" if curtain is None else f", {np.median(curtain):.1f} m away"
+            raise ValueError(
+                f"{error}; taken for the curtain: the {100 * green.share:.0f} % of the image that are green{where}"
+            ) from error
         is_person = person.depth > 0
         self.facts["area_m2"] = round(person.area_m2, 3)
         if curtain is not None:
@@ -151,7 +157,9 @@ def find_green(rgb: np.ndarray) -> tuple[Green, tuple[np.ndarray, np.ndarray]]:
             f"green, less than {100 * _LEAST_GREEN:.0f} %; is the curtain there, and lit? segmentation=depth_only does "
             "without one"
         )
-    of_red, of_green = (cv2.divide(each, total, dtype=cv2.CV_32F) - np.float32(1 / 3) for each in (red, green))
+    of_red, of_green = (
+        cv2.divide(each, total, dtype=cv2.CV_32F) - np.float32(1 / 3) for each in (red, green)
+    )
     step = max(1, np.count_nonzero(is_seed) // 5000)
     direction = [np.median(each[is_seed][::step]) for each in (of_red, of_green)]
     return Green(np.array(direction, np.float32), share), (of_red, of_green)
@@ -188,20 +196,26 @@ def _curtain_depth(depth: np.ndarray, is_green: np.ndarray, camera: Camera) -> n
     return 1 / np.maximum(inverse, np.float32(0.05))
 
 
+def nobody(reason: str) -> str:
+    """What is said where there is no person."""
+    return f"frame.depth: expected a person, found nobody: {reason}"
+
+
 def one_person(metres: np.ndarray, camera: Camera) -> Person:
     """The only person in a depth image `(H, W)` of what is before curtain, walls and floor, metres; 0 is nothing.
 
     Raises:
         ValueError: There is nobody, or more than one.
     """
-    nobody = "frame.depth: no person: "
     if not metres.any():
-        raise ValueError(f"{nobody}nothing stands before the background")
+        raise ValueError(nobody("nothing stands before the background"))
     person = find_person(metres, camera)
     if person.area_m2 < AREA_M2[0]:
         raise ValueError(
-            f"{nobody}the largest thing before the background measures {person.area_m2:.2f} square metres, less than "
-            f"{AREA_M2[0]:g}"
+            nobody(
+                f"the largest thing before the background measures {person.area_m2:.2f} square metres, less than "
+                f"{AREA_M2[0]:g}"
+            )
         )
     others = np.where(person.depth > 0, np.float32(0), metres)
     is_crowd = person.area_m2 > AREA_M2[1]
@@ -209,19 +223,23 @@ def one_person(metres: np.ndarray, camera: Camera) -> Person:
         other = find_person(others, camera)
         rows = np.flatnonzero(other.depth.any(1))
         z = float(np.median(other.depth[other.depth > 0]))
-        is_crowd = other.area_m2 > _OTHER_M2 and np.ptp(rows) * z / camera.fy > _OTHER_M
+        is_crowd = other.area_m2 > _OTHER_M2 and (rows[-1] - rows[0]) * z / camera.fy > _OTHER_M
     if is_crowd:
         raise ValueError(
-            "frame.depth: several persons stand before the background, or something of a person's size; one alone is "
-            "expected"
+            "frame.depth: several persons stand before the background, or something of a person's size; expected "
+            "one alone"
         )
     return person
+
+
+def _share(chosen: np.ndarray, among: np.ndarray) -> float:
+    return float(np.count_nonzero(chosen & among)) / max(1, int(np.count_nonzero(among)))
 
 
 def _check_colours(is_person: np.ndarray, is_green: np.ndarray, is_known: np.ndarray) -> None:
     inside = cv2.erode(is_person.astype(np.uint8), _disc(3)) > 0
     inside &= is_known
-    green = np.count_nonzero(inside & is_green) / max(1, np.count_nonzero(inside))
+    green = _share(is_green, inside)
     if green > _MOST_GREEN:
         raise ValueError(
             f"frame.rgb: the person's clothes are green: {100 * green:.0f} % of the person has the curtain's colour; "
@@ -231,7 +249,7 @@ def _check_colours(is_person: np.ndarray, is_green: np.ndarray, is_known: np.nda
     ring = (cv2.dilate(person, _disc(_RING_PX)) > cv2.dilate(person, _disc(4))) & is_known
     rows = np.flatnonzero(is_person.any(1))
     ring[rows[0] + int(0.8 * (rows[-1] - rows[0])) :] = False  # the floor
-    around = np.count_nonzero(ring & is_green) / max(1, np.count_nonzero(ring))
+    around = _share(is_green, ring)
     if around < _LEAST_RING:
         raise ValueError(
             f"frame.rgb: expected a green curtain behind the person, got {100 * around:.0f} % green around it; is the "
@@ -259,8 +277,7 @@ def _refined(
     window = slice(low[0], rows[-1] + 2 * _AROUND_PX), slice(low[1], columns[-1] + 2 * _AROUND_PX)
     person, colours = is_person[window].astype(np.uint8), rgb[window].astype(np.float32)
     sure = cv2.erode(person, _disc(_BAND_PX))
-    grown = cv2.dilate(person, _disc(_BAND_PX))
-    grown |= is_lost[window] & cv2.dilate(person, _disc(_WIDE_PX))
+    grown = cv2.dilate(person, _disc(_BAND_PX)) | (is_lost[window] & cv2.dilate(person, _disc(_WIDE_PX)))
     inner, outer = (sure > 0) & ~is_curtain[window], (grown == 0) & is_known[window]
     near, behind = _mean(colours, inner), _mean(colours, outer)
     towards = near - behind
