@@ -27,4 +27,4 @@ def write_recording(recording: SyntheticRecording, folder: str | Path, num_frame
             recorder.write(recording.frame(index))
     truths = [recording.truth(index) for index in range(number)]
     arrays = {name: np.stack([getattr(truth, name) for truth in truths]) for name in truths[0]._fields}
-    np.savez_compressed(Path(folder) / "truth.npz", **arrays)
+    np.savez_compressed(Path(folder) / "truth.npz", **arrays)  # type: ignore[arg-type]

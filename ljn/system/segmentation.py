@@ -29,6 +29,9 @@ _BY_DEPTH, _SHARE = 1.0, 0.4
 neighbours that are the person's by depth, less a half, exceed the second."""
 _CONTRAST = 40.0
 """Colours that differ by less, of 255 in each channel, do not say where the person ends: depth does."""
+_SMALLEST_LOST, _LARGEST_LOST, _LEAST_GREEN_RIM = 20, 0.25, 0.5
+"""A piece without depth that touches the person is its own if it has more pixels than the first, fewer than the second
+as a share of the person's, and green around it, where the person is not, along the third of its outline."""
 _RING_PX, _LEAST_RING = 12, 0.35
 _MOST_GREEN = 0.15
 _OTHER_M2, _OTHER_M = 0.15, 0.9
@@ -108,7 +111,9 @@ class GreenCurtain:
         if curtain is not None:
             self.facts["curtain_m"] = round(float(np.median(curtain[is_person])), 3)
         _check_colours(is_person, is_green, is_known)
-        is_lost = ((depth == 0) & ~is_green) | is_floor
+        is_lost = (depth == 0) & ~is_green
+        is_person |= _not_measured(is_person, is_lost & is_known, is_green)
+        is_lost |= is_floor
         return _refined(is_person, is_lost, is_green & ~is_before, is_known, rgb)
 
 
@@ -255,6 +260,32 @@ def _check_colours(is_person: np.ndarray, is_green: np.ndarray, is_known: np.nda
             f"frame.rgb: expected a green curtain behind the person, got {100 * around:.0f} % green around it; is the "
             "curtain large enough, and green? segmentation=depth_only does without one"
         )
+
+
+def _not_measured(is_person: np.ndarray, is_lost: np.ndarray, is_green: np.ndarray) -> np.ndarray:
+    """Hair and dark cloth that no depth was measured of: what is not green beside the person, before the curtain.
+
+    Args:
+        is_person: `(H, W)` bool, by depth.
+        is_lost: `(H, W)` bool, pixels without depth that are not green.
+        is_green: `(H, W)` bool.
+
+    Returns:
+        `(H, W)` bool.
+    """
+    _, labels, boxes, _ = cv2.connectedComponentsWithStats(is_lost.astype(np.uint8), connectivity=4)
+    most = _LARGEST_LOST * np.count_nonzero(is_person)
+    found = np.zeros(is_person.shape, bool)
+    for number in np.flatnonzero((boxes[:, 4] > _SMALLEST_LOST) & (boxes[:, 4] < most)):
+        left, top, width, height = boxes[number, :4]
+        box = slice(max(0, top - 4), top + height + 4), slice(max(0, left - 4), left + width + 4)
+        is_piece = labels[box] == number
+        around = (cv2.dilate(is_piece.astype(np.uint8), _disc(3)) > 0) & ~is_piece
+        if (around & is_person[box]).any() and _share(
+            is_green[box], around & ~is_person[box]
+        ) > _LEAST_GREEN_RIM:
+            found[box] |= is_piece
+    return found
 
 
 def _refined(
