@@ -38,7 +38,9 @@ ROOMS = {
     "from above": Room(height_m=2.2, tilt=0.5),
     "from below, tilted aside": Room(height_m=0.5, tilt=-0.15, roll=0.1),
     "behind a table": Room(
-        height_m=1.5, tilt=0.25, boxes=[Box((-1.3, 0.68, 2.3), (0.8, 0.04, 0.8)), Box((1.2, 0, 3.1), (0.6, 1.8, 0.5))]
+        height_m=1.5,
+        tilt=0.25,
+        boxes=[Box((-1.3, 0.68, 2.3), (0.8, 0.04, 0.8)), Box((1.2, 0, 3.1), (0.6, 1.8, 0.5))],
     ),
 }
 
