@@ -14,7 +14,7 @@ from datamodules.sensor import Sensor
 from datamodules.sources.embedded.source import FAMILY_SHARES, EmbeddedSource
 from ljn.body import SMPL, load_body_models
 from ljn.geometry.camera import Camera
-from ljn.geometry.rotations import CAMERA_FROM_BODY, rotation_about, rotvec_to_rotmat
+from ljn.geometry.rotations import CAMERA_FROM_BODY, rotation_about
 from ljn.render import get_renderer
 from ljn.tasks.schema import register
 

@@ -73,8 +73,8 @@ def body_depth(
         )
     if (share := jumps_share(metres)) > _NOISE:
         raise ValueError(
-            f"depth: {100 * share:.0f} % of the neighbouring pixels lie on different surfaces, which no person does: is it "
-            "noise, or are its bytes in another order, or its rows of another length?"
+            f"depth: {100 * share:.0f} % of the neighbouring pixels lie on different surfaces, as no person does: "
+            "is it noise, or are its bytes in another order, or its rows of another length?"
         )
     seen_m2 = float(np.square(metres, dtype=np.float64).sum()) / (camera.fx * camera.fy)
     is_scene = mask is None and seen_m2 > AREA_M2[1]

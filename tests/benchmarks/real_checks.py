@@ -22,7 +22,7 @@ class _Frame(NamedTuple):
 
 
 def measure(folder: Path, pictures: Path | None) -> None:
-    """Print a table; write a picture of each frame: grey depth, green what is found, red what is dropped of the mask."""
+    """Print a table; write a picture of each frame: grey depth, green what is found, red what is dropped."""
     quiet()
     pipeline = Pipeline.from_pretrained()
     counts = {name: Counter[str]() for name in ("mask", "mask 2 px too wide", "no mask")}
