@@ -57,7 +57,7 @@ def test_a_person_in_a_room_is_found_without_a_mask(name, standing):
 
 def test_an_empty_room_is_refused():
     depth = Room(boxes=[Box((-0.5, 0, 2.5), (0.8, 0.7, 0.6))]).depth(CAMERA)
-    with pytest.raises(ValueError, match="without a mask, no person was found.*give a mask"):
+    with pytest.raises(ValueError, match=r"without a mask, no person was found.*give a mask"):
         body_depth(depth, CAMERA)
 
 
