@@ -212,7 +212,9 @@ def find_planes(metres: np.ndarray, camera: Camera, least_m2: float = _PLANE_M2[
     chosen = rng.permutation(len(points))[:_POINTS]
     fits = _Surface(*(values[chosen] for values in surface)).is_on(*tried)
     is_left = np.ones(len(points), bool)
-    normals, offsets, areas = [], [], []
+    normals: list[np.ndarray] = []
+    offsets: list[float] = []
+    areas: list[float] = []
     while len(areas) < _MOST_PLANES and len(tried[1]):
         scores = (area * is_left)[chosen] @ fits * (len(points) / len(chosen))
         best = int(scores.argmax())
@@ -223,7 +225,9 @@ def find_planes(metres: np.ndarray, camera: Camera, least_m2: float = _PLANE_M2[
         on = is_left & surface.is_on(normal[None], np.array([offset]))[:, 0]
         if (size := float(area[on].sum())) >= least_m2:
             is_left &= ~on
-            normals.append(normal), offsets.append(offset), areas.append(size)
+            normals.append(normal)
+            offsets.append(offset)
+            areas.append(size)
     found = np.reshape(normals, (-1, 3)), np.array(offsets)
     is_seed = np.zeros(small.shape, bool)
     is_seed[v[~is_left], u[~is_left]] = True
