@@ -101,18 +101,26 @@ def _text(path: Path, max_bytes: int) -> str:
 def read_arrays(path: Path, keys: Collection[str] | None = None) -> dict[str, np.ndarray]:
     """The arrays of an `.npz` file, or those of `keys` that it has; the one of an `.npy` file under the key "".
 
+    See `read_entries`. Raises `READ_ERRORS`.
+    """
+    return {key: array_in(content) for key, content in read_entries(path, keys).items()}
+
+
+def read_entries(path: Path, keys: Collection[str] | None = None) -> dict[str, bytes]:
+    """The arrays' contents in an `.npz` file, or those of `keys` that it has; that of an `.npy` file under the key "".
+
     An archive may unpack to 256 MiB, or to 32 times its size where that is more. Raises `READ_ERRORS`.
     """
     with path.open("rb") as file:
         if file.read(2) != b"PK":
-            return {"": _array(path.read_bytes())}
+            return {"": path.read_bytes()}
         size = path.stat().st_size
         with zipfile.ZipFile(file) as archive:
             entries = {entry.filename.removesuffix(".npy"): entry for entry in archive.infolist()}
             wanted = {key: entry for key, entry in entries.items() if keys is None or key in keys}
             _check_entries(wanted.values(), max(_MAX_UNPACKED_BYTES, _MAX_UNPACKED_RATIO * size))
             # Reading a whole entry compares its checksum.
-            return {key: _array(archive.read(entry)) for key, entry in wanted.items()}
+            return {key: archive.read(entry) for key, entry in wanted.items()}
 
 
 def _check_entries(entries: Collection[zipfile.ZipInfo], max_bytes: int) -> None:
@@ -122,13 +130,25 @@ def _check_entries(entries: Collection[zipfile.ZipInfo], max_bytes: int) -> None
         raise ValueError(f"it would unpack to {size} bytes, expected at most {max_bytes}")
 
 
-def _array(content: bytes) -> np.ndarray:
-    """The array of an `.npy` file's content, of the size that its header says."""
-    stream, form = io.BytesIO(content), np.lib.format
+def pickle_in(content: bytes) -> bytes | None:
+    """The pickle in an `.npy` file's content that holds Python objects; None where it holds numbers or text."""
+    stream = io.BytesIO(content)
+    holds_objects = _header(stream)[2].hasobject
+    return content[stream.tell() :] if holds_objects else None
+
+
+def _header(stream: io.BytesIO) -> tuple[tuple[int, ...], bool, np.dtype]:
+    """Shape, order and type of an `.npy` file's array; the stream then stands at its data."""
+    form = np.lib.format
     if (version := form.read_magic(stream)) not in ((1, 0), (2, 0)):
         raise ValueError(f"an .npy file of version {version}")
-    read_header = form.read_array_header_1_0 if version == (1, 0) else form.read_array_header_2_0
-    shape, is_fortran, dtype = read_header(stream)
+    return form.read_array_header_1_0(stream) if version == (1, 0) else form.read_array_header_2_0(stream)
+
+
+def array_in(content: bytes) -> np.ndarray:
+    """The array of an `.npy` file's content, of the size that its header says."""
+    stream = io.BytesIO(content)
+    shape, is_fortran, dtype = _header(stream)
     if dtype.kind not in "biufcSU" or dtype.itemsize == 0 or min(shape, default=0) < 0:
         raise ValueError(f"it holds {brief(str(dtype))} of shape {shown(shape)}, expected numbers or text")
     start = stream.tell()

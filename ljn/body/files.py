@@ -1,4 +1,4 @@
-"""Reading body models in SMPL's format: the embedded files, `.npz`, and the official `.pkl`.
+"""Reading body models in SMPL's format: the embedded files, `.npz`, the official `.pkl`, and what numpy saves of it.
 
 The official files may hold chumpy arrays and scipy's sparse matrices; `ljn.body.unpickling` reads them without
 either package and without running anything.
@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ljn.body.skeleton import NUM_JOINTS, PARENTS
-from ljn.body.unpickling import ForbiddenContentError, read_pickled_arrays
-from ljn.reading import READ_ERRORS, read_arrays, reason, shown
+from ljn.body.unpickling import ForbiddenContentError, read_pickled_array, read_pickled_arrays
+from ljn.reading import READ_ERRORS, array_in, pickle_in, read_entries, reason, shown
 
 GENDERS: dict[str, int] = {"female": 0, "male": 1, "neutral": 2}
 """Gender codes: SURREAL's 0 and 1, and neutral."""
@@ -123,7 +123,8 @@ def load_body_model(path: str | Path | None = None, gender: str = "neutral") -> 
     """A body model read from a file, or an embedded one; checked.
 
     Args:
-        path: A `.npz` or an official `.pkl` in SMPL's format; None takes the embedded body of that gender.
+        path: A `.npz` or an official `.pkl` in SMPL's format, or what `numpy.save` or `savez` made of its dict; None
+            takes the embedded body of that gender.
         gender: A key of `GENDERS`: what to take, or, since the files do not say it, what `path` holds.
 
     Raises:
@@ -146,7 +147,7 @@ def load_body_model(path: str | Path | None = None, gender: str = "neutral") -> 
             f"{_OFFICIAL}"
         )
     if path.suffix.lower() not in _READERS:
-        raise ValueError(f"path: a body model should be a .npz or .pkl file, got {path}")
+        raise ValueError(f"path: a body model should be a .npz, .npy or .pkl file, got {path}")
 
     try:
         arrays = _READERS[path.suffix.lower()](path)
@@ -250,7 +251,7 @@ def _assemble(arrays: Mapping[str, Any], gender: str, path: Path) -> BodyModel:
     table = arrays["kintree_table"]
     root, *parents = table[0].tolist() if table.shape == (2, NUM_JOINTS) else (None,)
     # The official root is -1 written as an unsigned number.
-    if root not in (-1, 2**32 - 1) or tuple(parents) != PARENTS[1:]:
+    if root not in (-1, 2**32 - 1, 2**64 - 1) or tuple(parents) != PARENTS[1:]:
         raise ValueError(
             f"{path}: kintree_table should have shape (2, {NUM_JOINTS}) and begin with {PARENTS}, "
             f"got shape {table.shape} and {shown((root, *parents))}. {_NOT_SMPL}"
@@ -280,7 +281,24 @@ _FILE_NAMES = {
     gender: re.compile(rf"(smpl_)?{gender}|basicmodel_{official}_.*")
     for gender, official in (("female", "f"), ("male", "m"), ("neutral", "neutral"))
 }
+
+
+def _read_saved(path: Path) -> Mapping[str, Any]:
+    """The arrays of `numpy.savez(FILE, **DICT)`, `savez(FILE, DICT)` or `save(FILE, DICT)`."""
+    entries = read_entries(path, (*_KEYS, "arr_0", ""))
+    whole = entries.get("arr_0", entries.get(""))
+    if whole is not None and (pickled := pickle_in(whole)) is not None:
+        return read_pickled_arrays(pickled, _KEYS)
+    limit = sum(map(len, entries.values()))
+    contents = {key: (content, pickle_in(content)) for key, content in entries.items() if key in _KEYS}
+    return {
+        key: array_in(content) if pickled is None else read_pickled_array(pickled, key, limit)
+        for key, (content, pickled) in contents.items()
+    }
+
+
 _READERS: dict[str, Callable[[Path], Mapping[str, Any]]] = {
-    ".npz": lambda path: read_arrays(path, _KEYS),
+    ".npz": _read_saved,
+    ".npy": _read_saved,
     ".pkl": lambda path: read_pickled_arrays(path.read_bytes(), _KEYS),
 }

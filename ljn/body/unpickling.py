@@ -29,19 +29,45 @@ class ForbiddenContentError(Exception):
 def read_pickled_arrays(data: bytes, keys: Sequence[str]) -> dict[str, NDArray[Any]]:
     """The arrays of a pickled dict, those of `keys` that it holds; scipy's sparse matrices become dense.
 
+    The dict may also be the one object of an array, as `numpy.save` pickles it.
+
     Raises:
         ForbiddenContentError: It names something else than arrays and containers, or is not a dict of arrays.
         Exception: Whatever numpy and pickle raise at a damaged file.
     """
+    content = _object_of(_unpickled(data))
+    if not isinstance(content, dict):
+        raise ForbiddenContentError(f"should hold a dict, got {type(content).__name__}.")
+    return {key: _decode(content[key], key, len(data)) for key in keys if key in content}
+
+
+def read_pickled_array(data: bytes, key: str, limit: int) -> NDArray[Any]:
+    """The array that is the one object of a pickled array: a sparse matrix of `numpy.savez(FILE, **DICT)`.
+
+    It has no more entries than `limit`, the size of the whole file.
+
+    Raises:
+        ForbiddenContentError, Exception: See `read_pickled_arrays`.
+    """
+    return _decode(_object_of(_unpickled(data)), key, limit)
+
+
+def _unpickled(data: bytes) -> Any:
     for opcode, argument, _ in pickletools.genops(data):
         # The C unpickler of Python up to 3.13 allocates as many slots as the largest number says.
         if opcode.name in ("PUT", "BINPUT", "LONG_BINPUT") and (argument or 0) > len(data):
             raise ValueError("a memo number beyond the file's size")
     check_pickle(data)
-    content = _DataUnpickler(io.BytesIO(data), encoding="latin1").load()
-    if not isinstance(content, dict):
-        raise ForbiddenContentError(f"should hold a dict, got {type(content).__name__}.")
-    return {key: _decode(content[key], key, len(data)) for key in keys if key in content}
+    return _DataUnpickler(io.BytesIO(data), encoding="latin1").load()
+
+
+def _object_of(content: Any) -> Any:
+    """The one object of an array of objects; anything else as it is."""
+    if _kind_of(content) == "array" and isinstance(content.state, tuple) and len(content.state) == 5:
+        _, shape, _, _, objects = content.state
+        if shape == () and isinstance(objects, list) and len(objects) == 1:
+            return objects[0]
+    return content
 
 
 class _Record:

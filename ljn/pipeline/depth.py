@@ -5,8 +5,9 @@ from typing import Any
 import numpy as np
 
 from ljn.geometry.camera import Camera
-from ljn.pipeline.person import find_person
+from ljn.pipeline.person import find_person, jumps_share
 from ljn.pipeline.report import Report
+from ljn.pipeline.scene import Misfit, find_in_scene
 
 _FARTHEST_M = 20.0  # no depth camera sees a person farther away
 _NEAREST_MM = 100.0
@@ -19,11 +20,19 @@ DOUBTFUL_M2 = (0.15, 0.85)
 APART_M2 = 0.15
 """A piece of more than this that lies apart from the rest may be somebody else."""
 _SPAN_M = (0.4, 2.9)  # of the longest side: from a crouching child to a tall man who reaches up
+_NOISE = 0.4
+"""Of neighbouring pixels; of a person's, behind any sensor, less than a quarter jump."""
 _MUCH = 0.2
 """What is dropped is worth a warning from this share of the person's pixels on."""
 
 
-def body_depth(depth: Any, camera: Camera, mask: Any = None, report: Report | None = None) -> np.ndarray:
+def body_depth(
+    depth: Any,
+    camera: Camera,
+    mask: Any = None,
+    report: Report | None = None,
+    misfit: Misfit | None = None,
+) -> np.ndarray:
     """Depth of the person alone.
 
     Pixels that are NaN, infinite, negative, 0 or a sensor's code for nothing (from 65,000 on, in integers) are no
@@ -33,8 +42,10 @@ def body_depth(depth: Any, camera: Camera, mask: Any = None, report: Report | No
     Args:
         depth: `(H, W)` or `(H, W, 1)`: floating-point metres, or integer millimetres; 0 where nothing was measured.
         camera: The camera of this image.
-        mask: See `person_mask`; None where depth is 0 everywhere else already.
+        mask: See `person_mask`; None where depth is 0 everywhere else already, or for a person who is to be found in a
+            room (see `find_in_scene`).
         report: Gets what was found and dropped.
+        misfit: See `find_in_scene`.
 
     Returns:
         `(H, W)` float32, metres; 0 is background.
@@ -60,7 +71,14 @@ def body_depth(depth: Any, camera: Camera, mask: Any = None, report: Report | No
             f"depth: all pixels are 0, or no depth ({np.count_nonzero(depth)} are negative, NaN, infinite or a "
             "code for nothing): nothing was measured; is the file or the stream the right one?"
         )
-    person = find_person(metres, camera)
+    if (share := jumps_share(metres)) > _NOISE:
+        raise ValueError(
+            f"depth: {100 * share:.0f} % of the neighbouring pixels lie on different surfaces, as no person does: "
+            "is it noise, or are its bytes in another order, or its rows of another length?"
+        )
+    seen_m2 = float(np.square(metres, dtype=np.float64).sum()) / (camera.fx * camera.fy)
+    is_scene = mask is None and seen_m2 > AREA_M2[1]
+    person = find_in_scene(metres, camera, report, misfit) if is_scene else find_person(metres, camera)
     num_pixels = int(np.count_nonzero(person.depth))
     report.note(
         pixels=num_pixels,
@@ -71,7 +89,7 @@ def body_depth(depth: Any, camera: Camera, mask: Any = None, report: Report | No
             "flying": person.num_flying,
         },
     )
-    num_dropped = person.num_foreign + person.num_rim + person.num_flying
+    num_dropped = 0 if is_scene else person.num_foreign + person.num_rim + person.num_flying
     _check_size(person.depth, person.area_m2, camera, mask is not None, report)
     if person.apart_m2 > APART_M2:
         report.doubt(

@@ -50,6 +50,15 @@ def pieces_of(metres: np.ndarray, camera: Camera) -> Pieces:
     return Pieces(labels, area / (camera.fx * camera.fy), pixels, thickness * z / pixels / camera.fx, behind)
 
 
+def jumps_share(metres: np.ndarray) -> float:
+    """The share of a depth image's neighbours, one beside the other, whose depth jumps; 0 of fewer than 50 pairs."""
+    left, right = metres[:, :-1], metres[:, 1:]
+    is_pair = (left > 0) & (right > 0)
+    number = np.count_nonzero(is_pair)
+    jumps = is_pair & (np.abs(right - left) > JUMP_M + JUMP_SHARE * left)
+    return np.count_nonzero(jumps) / number if number >= 50 else 0.0
+
+
 class Person(NamedTuple):
     """The person in a depth image.
 
@@ -58,7 +67,8 @@ class Person(NamedTuple):
         area_m2: Its area, seen across the line of sight.
         apart_m2: Area of the largest piece of it that is apart from the rest by more than `APART_M`; 0 without one.
         foreign_m2: Area of what is too far from it in space to be a part.
-        num_foreign: Pixels of that.
+        beside_m2: Of that, the area that is nearer to it than twice the distance within which pieces belong together.
+        num_foreign: Pixels of what is too far.
         num_rim: Pixels of a rim of the background, left by a mask too wide.
         num_flying: Flying pixels.
     """
@@ -67,17 +77,19 @@ class Person(NamedTuple):
     area_m2: float
     apart_m2: float
     foreign_m2: float
+    beside_m2: float
     num_foreign: int
     num_rim: int
     num_flying: int
 
 
-def find_person(metres: np.ndarray, camera: Camera) -> Person:
+def find_person(metres: np.ndarray, camera: Camera, near_m: float = NEAR_M) -> Person:
     """The largest piece of a depth image and all that is near it in space, without rims and flying pixels.
 
     Args:
         metres: `(H, W)` float32, metres; 0 is nothing; something is there.
         camera: The camera of this image.
+        near_m: Pieces nearer than this belong together.
     """
     pieces = pieces_of(metres, camera)
     number = len(pieces.pixels)
@@ -111,7 +123,7 @@ def find_person(metres: np.ndarray, camera: Camera) -> Person:
         is_rim = ~is_person & (pieces.thickness_m < THIN_M) & (pieces.is_behind > 0.5) & (distance > RIM_M)
         is_rim &= (pieces.area_m2 / pieces.thickness_m)[is_rim].sum() > LONG_M
         is_flying = (pieces.area_m2 < SPECK_M2) & (distance > STRAY_M)
-        joins = ~is_person & (distance < NEAR_M) & ~is_rim & ~is_flying
+        joins = ~is_person & (distance < near_m) & ~is_rim & ~is_flying
         fresh = np.flatnonzero(joins).tolist()
         is_person |= joins
     depth = np.where(np.append(is_person, False)[pieces.labels], metres, np.float32(0))
@@ -121,6 +133,7 @@ def find_person(metres: np.ndarray, camera: Camera) -> Person:
         float(pieces.area_m2[is_person].sum()),
         float(pieces.area_m2[is_person & np.isfinite(distance) & (distance > APART_M)].max(initial=0)),
         float(pieces.area_m2[is_foreign].sum()),
+        float(pieces.area_m2[is_foreign & (distance < 2 * near_m)].sum()),
         int(pieces.pixels[is_foreign].sum()),
         int(pieces.pixels[~is_person & is_rim].sum()),
         int(pieces.pixels[~is_person & is_flying & ~is_rim].sum()),

@@ -2,12 +2,15 @@
 
 import logging
 from collections.abc import Mapping, Sequence
+from copy import copy
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
 import numpy as np
 import torch
+from scipy.spatial import cKDTree
 
 from ljn.body.skeleton import ROOT
 from ljn.cloud.observation import Observation, observe, stack_observations
@@ -222,7 +225,10 @@ class Pipeline:
         `report` gets what was found and done; it is the frame's, and its prediction's.
         """
         report = Report(is_strict=self.is_strict) if report is None else report
-        metres = body_depth(depth, camera, mask, report)
+        misfit = None
+        if self.regressor is not None and not self.needs_keypoints:
+            misfit = partial(self._misfit_m, camera)
+        metres = body_depth(depth, camera, mask, report, misfit)
         named = None
         if keypoints is not None:
             min_known = MIN_KNOWN if self.needs_keypoints else 1
@@ -301,6 +307,14 @@ class Pipeline:
         reports = tuple(frame.report for frame in frames)
         on_cpu: dict[str, Any] = {name: value.cpu().numpy() for name, value in arrays.items()}
         return Prediction(found.cpu().numpy(), **on_cpu, report=reports)
+
+    def _misfit_m(self, camera: Camera, depth: np.ndarray) -> float:
+        """How far a depth image lies from the mesh found in it: 90 % of the cloud's points are nearer, metres."""
+        plain = copy(self)
+        plain.refiner = None  # a fit would draw the mesh to anything
+        found = plain.predict([plain.observe_body(depth, camera)])
+        assert found.vertices is not None
+        return float(np.percentile(cKDTree(found.vertices[0]).query(found.points[0, :, :3])[0], 90))
 
     def _meshes(
         self,

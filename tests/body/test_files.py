@@ -386,10 +386,39 @@ def test_a_truncated_file_is_called_damaged(tmp_path, suffix, kept):
         load_body_model(path)
 
 
-def test_python_objects_in_an_archive_are_refused(tmp_path):
-    path = write_npz(tmp_path / "body.npz", {**smpl_fields(), "weights": np.array([{}], object)})
-    with pytest.raises(ValueError, match=r"holds object of shape .*expected numbers or text"):
+def test_what_numpy_saves_of_an_official_dict_is_the_same_body(tmp_path):
+    fields = smpl_fields()
+    expected = load_body_model(write_npz(tmp_path / "plain.npz", fields))
+    sparse = {**fields, "J_regressor": scipy.sparse.csc_matrix(fields["J_regressor"]), "bs_style": "lbs"}
+    np.savez(tmp_path / "entries.npz", **sparse)
+    np.savez(tmp_path / "dict.npz", sparse)
+    np.save(tmp_path / "dict.npy", sparse, allow_pickle=True)
+    for name in ("entries.npz", "dict.npz", "dict.npy"):
+        assert load_body_model(tmp_path / name).hash == expected.hash, name
+
+
+@pytest.mark.parametrize("root", [-1, 2**32 - 1, 2**64 - 1])
+@pytest.mark.parametrize("suffix", [".npz", ".pkl"])
+def test_the_root_s_parent_is_minus_one_in_any_type(tmp_path, suffix, root):
+    fields = smpl_fields()
+    kind = np.int64 if root < 0 else np.uint64
+    table = fields["kintree_table"].astype(kind)
+    table[0, 0] = root
+    load_body_model(write(tmp_path / f"body{suffix}", {**fields, "kintree_table": table}))
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".npy"])
+def test_python_objects_in_an_archive_are_refused(tmp_path, suffix):
+    evil = {**smpl_fields(), "weights": Call(os.abort)}
+    path = tmp_path / f"body{suffix}"
+    (np.savez if suffix == ".npz" else np.save)(path, evil, allow_pickle=True)
+    with pytest.raises(ValueError, match=r"names .*abort, which a SMPL model never needs"):
         load_body_model(path)
+    np.savez(tmp_path / "body.npz", **{**smpl_fields(), "weights": np.array([{}], object)})
+    with pytest.raises(
+        ValueError, match=r"weights should be an array, a chumpy array or a sparse matrix|damaged"
+    ):
+        load_body_model(tmp_path / "body.npz")
 
 
 def test_a_gender_that_is_not_embedded_is_refused_with_those_that_are(tmp_path, monkeypatch):
@@ -406,7 +435,7 @@ def test_an_unknown_gender_file_or_type_of_file_is_refused(tmp_path):
     with pytest.raises(ValueError, match="gender: expected one of female, male, neutral, got 'm'"):
         load_body_model(gender="m")
     (tmp_path / "body.mat").touch()
-    with pytest.raises(ValueError, match=r"should be a \.npz or \.pkl file"):
+    with pytest.raises(ValueError, match=r"should be a \.npz, \.npy or \.pkl file"):
         load_body_model(tmp_path / "body.mat")
 
 
