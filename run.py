@@ -47,7 +47,7 @@ if __name__ == "__main__":
     end_on_signals()
     try:
         sys.argv[1:] = prepare_arguments(sys.argv[1:])
-    except ValueError as error:
+    except (ValueError, ImportError) as error:
         sys.exit(f"error: {error}")
     try:
         main()

@@ -2,6 +2,7 @@
 
 import atexit
 import csv
+import logging
 import os
 import shlex
 import sys
@@ -19,6 +20,8 @@ from ljn.runs.files import path_part, read_json, write_json
 from ljn.runs.sweep import job_of, read_jobs, settings
 from ljn.tasks.processes import sweep_name
 
+_LOG = logging.getLogger(__name__)
+
 
 class SweepReport(Callback):
     """Hydra callback: gathers a multirun's runs in `output_dir/sweeps/NAME-PRESET` and writes their tables.
@@ -34,22 +37,41 @@ class SweepReport(Callback):
 
     def on_job_start(self, config: DictConfig, **kwargs: Any) -> None:
         """Note that a job runs: so it stays, without a result, where the sweep ends in the middle of it."""
-        if config.hydra.mode == RunMode.MULTIRUN:
+        if config.hydra.mode == RunMode.MULTIRUN and _has_table(config):
             self._note(config, run_dir=None, status="running", error=None)
 
     def on_job_end(self, config: DictConfig, job_return: JobReturn, **kwargs: Any) -> None:
         """Note what became of a job; write the tables of all so far."""
-        if config.hydra.mode != RunMode.MULTIRUN:
+        if config.hydra.mode != RunMode.MULTIRUN or not _has_table(config):
             return
         assert job_return.cfg is not None
         run_dir = self._relative(job_return.cfg.paths.run_dir)
         if job_return.status == JobStatus.COMPLETED:
             self._note(config, run_dir=run_dir, status="complete", error=None)
+            self._warn_of_equal(config)
         else:
             error = job_return._return_value  # reading `return_value` would raise it
             self._note(config, run_dir=run_dir, status="failed", error=f"{type(error).__name__}: {error}")
         write_report(self._gather(config), is_final=False)
         self._sum_up_at_exit()
+
+    def _warn_of_equal(self, config: DictConfig) -> None:
+        """Say if this job has other values than an earlier one of its experiment, but found the earlier one's run."""
+        number, notes = int(config.hydra.job.num), self._notes(config)
+        this, *others = (
+            job_of(read_json(path) or {})
+            for path in (notes / f"{number:04d}.json", *sorted(notes.glob("*.json")))
+        )
+        for other in others:
+            differing = set(this["overrides"]) - set(other["overrides"])
+            is_same = all(this[key] == other[key] for key in ("run_dir", "experiment", "seed"))
+            if this["run_dir"] and is_same and differing and other["status"] == "complete":
+                _LOG.warning(
+                    "job %d is the same run as one before it: nothing of its experiment depends on %s; leave that out "
+                    "of the sweep, or choose a key that the experiment reads",
+                    *(number, ", ".join(sorted(differing))),
+                )
+                return
 
     def _note(self, config: DictConfig, **outcome: str | None) -> None:
         """Write a job's note, which takes the place of an earlier one."""
@@ -141,6 +163,11 @@ class SweepReport(Callback):
     def _relative(self, run_dir: str | None) -> str | None:
         """A run's directory as seen from `output_dir`, so that the whole output can be moved."""
         return None if run_dir is None else os.path.relpath(run_dir, self.output_dir)
+
+
+def _has_table(config: DictConfig) -> bool:
+    """Whether the jobs' task gives the metrics that a table is of."""
+    return config.hydra.runtime.choices.get("task", "train") in ("train", "evaluate", "cross")
 
 
 def _key(job: dict[str, Any], preset: str) -> tuple[tuple[Any, ...], Any]:

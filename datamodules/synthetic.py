@@ -165,6 +165,11 @@ class SyntheticDepthDataModule(RenderedDataModule):
         get_renderer(self.synthesis.renderer)
         get_normal_estimator(self.observation.normals)
 
+    @property
+    def detector_file(self) -> Path | None:
+        """See `DataModule.detector_file`."""
+        return None if self.detector_ckpt is None else Path(self.detector_ckpt)
+
     @cached_property
     def _detector_checkpoint(self) -> tuple[JointDetector, Checkpoint] | None:
         if self.detector_ckpt is None:

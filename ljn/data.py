@@ -2,6 +2,7 @@
 
 from abc import abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TypedDict
 
 import numpy as np
@@ -115,6 +116,11 @@ class DataModule(LightningDataModule):
     @property
     def detector(self) -> torch.nn.Module | None:
         """The joint detector whose joints stand in place of the initial ones; None without one."""
+        return None
+
+    @property
+    def detector_file(self) -> Path | None:
+        """The file of that detector: its content goes into checkpoints."""
         return None
 
     def groups(self, split: str) -> dict[str, np.ndarray]:

@@ -14,7 +14,7 @@ from datamodules.sensor import Sensor
 from datamodules.sources.embedded.source import FAMILY_SHARES, EmbeddedSource
 from ljn.body import SMPL, load_body_models
 from ljn.geometry.camera import Camera
-from ljn.geometry.rotations import CAMERA_FROM_BODY, rotation_about, rotvec_to_rotmat
+from ljn.geometry.rotations import CAMERA_FROM_BODY, rotation_about
 from ljn.render import get_renderer
 from ljn.tasks.schema import register
 
@@ -84,7 +84,7 @@ class Room:
             cos, sin = np.cos(box.turn), np.sin(box.turn)
             turn = np.array([[cos, 0, sin], [0, 1, 0], [-sin, 0, cos]])
             half = np.array([box.size[0] / 2, 0, box.size[2] / 2])
-            low, high = -half, half + [0, box.size[1], 0]
+            low, high = -half, half + np.array([0, box.size[1], 0])
             enter, leave = _through((start - box.centre) @ turn, rays @ turn, low, high)
             nearest = np.where((enter < leave) & (enter > 0), np.minimum(nearest, enter), nearest)
         for centre, radii in self.balls:
@@ -126,7 +126,7 @@ def body_in_room(vertices: np.ndarray, at: tuple[float, float], heading: float) 
     points = turned @ CAMERA_FROM_BODY.numpy().T * [1.0, -1, 1]  # y up
     low, high = points.min(0), points.max(0)
     middle = (low + high) / 2
-    return points + [at[0] - middle[0], -low[1], at[1] - middle[2]]
+    return points + np.array([at[0] - middle[0], -low[1], at[1] - middle[2]])
 
 
 def render(vertices: np.ndarray, faces: torch.Tensor, room: Room, camera: Camera) -> np.ndarray:

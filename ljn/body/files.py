@@ -123,7 +123,7 @@ def load_body_model(path: str | Path | None = None, gender: str = "neutral") -> 
     """A body model read from a file, or an embedded one; checked.
 
     Args:
-        path: A `.npz`, an official `.pkl`, or what `numpy.save` or `savez` made of its dict, in SMPL's format; None
+        path: A `.npz` or an official `.pkl` in SMPL's format, or what `numpy.save` or `savez` made of its dict; None
             takes the embedded body of that gender.
         gender: A key of `GENDERS`: what to take, or, since the files do not say it, what `path` holds.
 

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from ljn.geometry.camera import Camera
-from ljn.pipeline.person import find_person
+from ljn.pipeline.person import find_person, jumps_share
 from ljn.pipeline.report import Report
 from ljn.pipeline.scene import Misfit, find_in_scene
 
@@ -20,6 +20,8 @@ DOUBTFUL_M2 = (0.15, 0.85)
 APART_M2 = 0.15
 """A piece of more than this that lies apart from the rest may be somebody else."""
 _SPAN_M = (0.4, 2.9)  # of the longest side: from a crouching child to a tall man who reaches up
+_NOISE = 0.4
+"""Of neighbouring pixels; of a person's, behind any sensor, less than a quarter jump."""
 _MUCH = 0.2
 """What is dropped is worth a warning from this share of the person's pixels on."""
 
@@ -68,6 +70,11 @@ def body_depth(
         raise ValueError(
             f"depth: all pixels are 0, or no depth ({np.count_nonzero(depth)} are negative, NaN, infinite or a "
             "code for nothing): nothing was measured; is the file or the stream the right one?"
+        )
+    if (share := jumps_share(metres)) > _NOISE:
+        raise ValueError(
+            f"depth: {100 * share:.0f} % of the neighbouring pixels lie on different surfaces, as no person does: "
+            "is it noise, or are its bytes in another order, or its rows of another length?"
         )
     seen_m2 = float(np.square(metres, dtype=np.float64).sum()) / (camera.fx * camera.fy)
     is_scene = mask is None and seen_m2 > AREA_M2[1]

@@ -50,6 +50,15 @@ def pieces_of(metres: np.ndarray, camera: Camera) -> Pieces:
     return Pieces(labels, area / (camera.fx * camera.fy), pixels, thickness * z / pixels / camera.fx, behind)
 
 
+def jumps_share(metres: np.ndarray) -> float:
+    """The share of a depth image's neighbours, one beside the other, whose depth jumps; 0 of fewer than 50 pairs."""
+    left, right = metres[:, :-1], metres[:, 1:]
+    is_pair = (left > 0) & (right > 0)
+    number = np.count_nonzero(is_pair)
+    jumps = is_pair & (np.abs(right - left) > JUMP_M + JUMP_SHARE * left)
+    return np.count_nonzero(jumps) / number if number >= 50 else 0.0
+
+
 class Person(NamedTuple):
     """The person in a depth image.
 

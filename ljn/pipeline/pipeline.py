@@ -2,6 +2,7 @@
 
 import logging
 from collections.abc import Mapping, Sequence
+from copy import copy
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -309,8 +310,9 @@ class Pipeline:
 
     def _misfit_m(self, camera: Camera, depth: np.ndarray) -> float:
         """How far a depth image lies from the mesh found in it: 90 % of the cloud's points are nearer, metres."""
-        frame = self.observe_body(depth, camera)
-        found = self.predict([frame])
+        plain = copy(self)
+        plain.refiner = None  # a fit would draw the mesh to anything
+        found = plain.predict([plain.observe_body(depth, camera)])
         assert found.vertices is not None
         return float(np.percentile(cKDTree(found.vertices[0]).query(found.points[0, :, :3])[0], 90))
 

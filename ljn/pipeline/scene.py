@@ -113,8 +113,8 @@ def find_in_scene(metres: np.ndarray, camera: Camera, report: Report, misfit: Mi
         report.doubt(f"depth: without a mask, what was taken, {place}, is hardly like a person{_NO_MASK}")
     if figures[best].cut_m > _CUT_M:
         report.doubt(
-            f"depth: without a mask, the person, {place}, had to be cut out of what it touches: a part of it may be "
-            f"lost{_NO_MASK}"
+            f"depth: without a mask, the person, {place}, had to be cut out of what it touches, and a part of it may "
+            f"be lost{_NO_MASK}"
         )
     elif found.beside_m2 > _BESIDE_M2:
         report.doubt(

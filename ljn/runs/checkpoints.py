@@ -44,8 +44,9 @@ class Provenance(Callback):
         data_licence: str,
         run: str,
         recipe: ObservationRecipe | RgbRecipe | None,
+        detector: bytes | None = None,
     ) -> None:
-        self.content = {
+        self.content: dict[str, Any] = {
             "version": CHECKPOINT_VERSION,
             "config": config,
             "body_hash": body_hash,
@@ -53,6 +54,8 @@ class Provenance(Callback):
             "run": run,
             "observation": None if recipe is None else _plain_recipe(recipe),
         }
+        if detector is not None:
+            self.content["detector"] = torch.frombuffer(bytearray(detector), dtype=torch.uint8)
 
     def on_save_checkpoint(self, trainer: Any, pl_module: Any, checkpoint: dict[str, Any]) -> None:
         """Add the content under its key."""
@@ -93,6 +96,7 @@ class Checkpoint:
     recipe: ObservationRecipe | RgbRecipe | None
     state: dict[str, Tensor]  # the module's state dict
     file_hash: str  # first 16 hex digits of the file's SHA-256
+    detector: bytes | None = None  # content of the file of the detector whose joints it was trained on
 
     def unknown_bodies(self, hashes: Iterable[str]) -> list[str]:
         """Those of the bodies' hashes that it was not trained with: a model is only meaningful with its bodies."""
@@ -137,6 +141,7 @@ def read_checkpoint(path: str | Path, name: str = "ckpt_path", stage: str = "det
             f"{name}: '{path}' was written by {age} version of this library (checkpoint version "
             f"{provenance['version']}, this one reads {CHECKPOINT_VERSION}); {fix}"
         )
+    detector = provenance.get("detector")
     try:
         checkpoint = Checkpoint(
             path=path,
@@ -145,7 +150,8 @@ def read_checkpoint(path: str | Path, name: str = "ckpt_path", stage: str = "det
             epoch=content["epoch"] + 1,
             recipe=_read_recipe(provenance.get("observation")),
             state=dict(content["state_dict"]),
-            file_hash=hashlib.sha256(data).hexdigest()[:16],
+            file_hash=hash_of(data),
+            detector=None if detector is None else _bytes_of(detector, len(data)),
         )
         _check_state(checkpoint.state, len(data))
         _check_content(checkpoint)
@@ -175,6 +181,17 @@ def _read_recipe(plain: Any) -> ObservationRecipe | RgbRecipe | None:
 
 def _path_of(kind: type) -> str:
     return f"{kind.__module__}.{kind.__qualname__}"
+
+
+def hash_of(data: bytes) -> str:
+    """What a checkpoint's file is known by."""
+    return hashlib.sha256(data).hexdigest()[:16]
+
+
+def _bytes_of(value: Any, limit: int) -> bytes:
+    if not (isinstance(value, Tensor) and value.dtype == torch.uint8 and value.numel() <= limit):
+        raise ValueError(f"detector: expected the bytes of a file, got {shown(type(value).__name__)}")
+    return value.cpu().numpy().tobytes()
 
 
 def _content(path: Path, data: bytes, name: str, stage: str) -> Any:

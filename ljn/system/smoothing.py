@@ -22,13 +22,13 @@ class SmoothingSettings:
         joint_beta: How much it rises with the speed, hertz for each metre a second.
         rotation_cutoff_hz: Cutoff of the rotations at rest, hertz.
         rotation_beta: How much it rises, hertz for each radian a second.
-        shape_cutoff_hz: Cutoff of the shape, which does not move.
+        shape_cutoff_hz: Cutoff of the shape, which does not move; at first it is the mean of what there is.
     """
 
-    joint_cutoff_hz: float = 1.5
-    joint_beta: float = 8.0
-    rotation_cutoff_hz: float = 1.5
-    rotation_beta: float = 2.0
+    joint_cutoff_hz: float = 3.0
+    joint_beta: float = 25.0
+    rotation_cutoff_hz: float = 4.0
+    rotation_beta: float = 6.0
     shape_cutoff_hz: float = 0.1
 
     def __post_init__(self) -> None:
@@ -95,6 +95,20 @@ class OneEuroRotation(OneEuro):
         return value @ rotvec_to_rotmat(change)
 
 
+class SlowMean(OneEuro):
+    """The filter of what hardly changes: the mean of all values, until the cutoff makes it forget the first ones."""
+
+    def __call__(self, value: Tensor, seconds: float) -> Tensor:
+        """See `OneEuro`."""
+        if self.value is None or self.velocity is None:
+            self.value, self.velocity = value, torch.ones(())  # how many values there were
+            return value
+        self.velocity = self.velocity + 1
+        share = max(_share(self.cutoff_hz, seconds), 1 / float(self.velocity))
+        self.value = self.value + share * (value - self.value)
+        return self.value
+
+
 def _share(cutoff_hz: Any, seconds: float) -> Any:
     """How much of a change passes: 1 / (1 + tau / dt)."""
     return 1 / (1 + 1 / (2 * math.pi * cutoff_hz * seconds))
@@ -118,7 +132,7 @@ class PoseSmoother:
             "joints": OneEuro(of.joint_cutoff_hz, of.joint_beta),
             "root": OneEuro(of.joint_cutoff_hz, of.joint_beta),
             "rotmats": OneEuroRotation(of.rotation_cutoff_hz, of.rotation_beta),
-            "betas": OneEuro(of.shape_cutoff_hz, 0.0),
+            "betas": SlowMean(of.shape_cutoff_hz, 0.0),
         }
 
     def __call__(self, values: dict[str, Tensor], seconds: float) -> dict[str, Tensor]:

@@ -3,6 +3,7 @@
 import os
 import re
 from collections.abc import Sequence
+from importlib.util import find_spec
 from pathlib import Path
 
 from hydra.core.override_parser.types import Quote, QuotedString
@@ -24,6 +25,14 @@ _OF_SOURCE = re.compile(r"data\.source\.(sources\.\w+\.)?(path|split_path|splits
 # What is no bare path: nothing, quoted, a list, an interpolation, or several values of a sweep.
 _NOT_BARE = re.compile(r"""$|null$|['"\[]|.*\$\{|.*,|(choice|glob|tag)\(""")
 
+_PLUGINS = {
+    "hydra/launcher=parallel": ("hydra_joblib_launcher", "sweep"),
+    "hydra/launcher=local": ("hydra_submitit_launcher", "sweep"),
+    "hydra/launcher=slurm": ("hydra_submitit_launcher", "sweep"),
+    "sweep=search": ("hydra_optuna_sweeper", "optuna"),
+}
+"""What of Hydra is no part of it: the plugin's module, and this project's extra that brings it."""
+
 
 def prepare_arguments(arguments: Sequence[str]) -> list[str]:
     """A command line's arguments with every path in quotes, as Hydra needs it for `2023_04_01` or `a=b`.
@@ -33,8 +42,18 @@ def prepare_arguments(arguments: Sequence[str]) -> list[str]:
 
     Raises:
         ValueError: Such a key is given to another task.
+        ImportError: A launcher or a sweeper is chosen whose package is missing.
     """
+    for argument in arguments:
+        if (plugin := _PLUGINS.get(argument)) and not _is_there(plugin[0]):
+            raise ImportError(
+                f"{argument}: it needs a package that is not installed: pip install -e '.[{plugin[1]}]'"
+            )
     return [_prepare(argument, arguments) for argument in arguments]
+
+
+def _is_there(plugin: str) -> bool:
+    return find_spec("hydra_plugins") is not None and find_spec(f"hydra_plugins.{plugin}") is not None
 
 
 def _prepare(argument: str, arguments: Sequence[str]) -> str:

@@ -1,13 +1,15 @@
 """A call's overrides, and what an evaluation makes of them and of its checkpoint's configuration."""
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
 
-from ljn.runs.checkpoints import Checkpoint
+from ljn.runs.checkpoints import Checkpoint, hash_of
+from ljn.runs.files import write_atomically
 from ljn.runs.keys import CONFIG_GROUPS, Key, key_of, kind_of
 
 # A stored configuration is resolved: what was made of the body's group has to follow by hand.
@@ -34,6 +36,7 @@ def with_checkpoint_config(cfg: DictConfig, checkpoint: Checkpoint, overrides: l
     poses, or images, are those of another source.
 
     Raises:
+        FileNotFoundError: The detector of a checkpoint that carries none has gone.
         ValueError: An override is about something that the checkpoint decides.
     """
     plain: dict[str, Any] = OmegaConf.to_container(cfg, resolve=False)  # type: ignore[assignment]
@@ -44,7 +47,28 @@ def with_checkpoint_config(cfg: DictConfig, checkpoint: Checkpoint, overrides: l
         if any(line.startswith(start) for line in overrides):
             OmegaConf.update(merged, key, OmegaConf.select(cfg, key), merge=False, force_add=True)
     apply_overrides(merged, [line for line in overrides if not line.startswith(tuple(_WHOLE))])
+    _find_detector(merged, checkpoint)
     return merged
+
+
+def _find_detector(cfg: DictConfig, checkpoint: Checkpoint) -> None:
+    """Name the detector that a checkpoint carries in place of its file, where that has gone or is another one now."""
+    path = OmegaConf.select(cfg, "data.detector_ckpt")
+    if path is None or path != checkpoint.config["data"].get("detector_ckpt"):
+        return
+    file, name = Path(path), "" if checkpoint.detector is None else hash_of(checkpoint.detector)
+    if checkpoint.detector is None:
+        if not file.is_file():
+            raise FileNotFoundError(
+                f"data.detector_ckpt: no file '{path}', the detector whose joints '{checkpoint.path}' was trained on; "
+                "name its place with data.detector_ckpt=FILE, or test on the data's own joints with "
+                "data.detector_ckpt=null"
+            )
+    elif not file.is_file() or hash_of(file.read_bytes()) != name:
+        carried = Path(cfg.paths.cache_dir) / "detectors" / f"{name}{file.suffix}"
+        carried.parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(carried, checkpoint.detector)
+        cfg.data.detector_ckpt = str(carried)
 
 
 def _with_call(stored: Any, call: Any, key: str) -> Any:

@@ -66,8 +66,10 @@ def build_trainer(
 ) -> lightning.Trainer:
     """The trainer with its callbacks and loggers, writing below the run's directory."""
     body_hashes = {body.hash for body in datamodule.bodies} | set(module.body_hashes)
+    detector = datamodule.detector_file
     provenance = Provenance(
-        config, "-".join(sorted(body_hashes)), datamodule.licence, run_dir.name, datamodule.recipe
+        *(config, "-".join(sorted(body_hashes)), datamodule.licence, run_dir.name, datamodule.recipe),
+        None if detector is None else detector.read_bytes(),
     )
     return build(
         cfg.trainer,

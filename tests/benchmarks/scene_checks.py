@@ -17,7 +17,7 @@ FOUND = 0.9
 def measure(number: int, split: str) -> None:
     """Print the table."""
     outcomes: dict[str, Counter[str]] = defaultdict(Counter)
-    logging.getLogger("ljn").setLevel(logging.ERROR)  # doubts are counted, not shown
+    quiet()
     pipeline = Pipeline.from_pretrained()
     milliseconds = []
     for scene in scenes(number, split):
@@ -39,6 +39,11 @@ def measure(number: int, split: str) -> None:
             + " |"
         )
     print(f"\n{np.median(milliseconds):.0f} ms of one core in the median, {np.max(milliseconds):.0f} at most")
+
+
+def quiet() -> None:
+    """Doubts are counted, not shown."""
+    logging.getLogger("ljn").setLevel(logging.ERROR)
 
 
 def outcome_of(scene: Scene, pipeline: Pipeline) -> str:

@@ -415,7 +415,9 @@ def test_python_objects_in_an_archive_are_refused(tmp_path, suffix):
     with pytest.raises(ValueError, match=r"names .*abort, which a SMPL model never needs"):
         load_body_model(path)
     np.savez(tmp_path / "body.npz", **{**smpl_fields(), "weights": np.array([{}], object)})
-    with pytest.raises(ValueError, match=r"weights should be an array, a chumpy array or a sparse matrix|damaged"):
+    with pytest.raises(
+        ValueError, match=r"weights should be an array, a chumpy array or a sparse matrix|damaged"
+    ):
         load_body_model(tmp_path / "body.npz")
 
 

@@ -14,16 +14,17 @@ from callbacks.sweep_report import SweepReport
 def end_job(tmp_path):
     """Let a job of a call end; returns the jobs that `sweep.json` then names."""
 
-    def end(call, number, run_dir, status=JobStatus.COMPLETED, typed=()):
+    def end(call, number, run_dir, status=JobStatus.COMPLETED, typed=(), seed=None, task="train"):
         """With no status, the sweep ends in the middle of the job."""
         hydra = {
             "mode": RunMode.MULTIRUN,
-            "overrides": {"task": [f"seed={number}", *typed]},
-            "runtime": {"choices": {"experiment": "detector/proposed", "sweep": "table_3_4"}},
+            "overrides": {"task": [f"seed={number if seed is None else seed}", *typed]},
+            "runtime": {"choices": {"experiment": "detector/proposed", "sweep": "table_3_4", "task": task}},
             "sweep": {"dir": str(tmp_path / "multirun" / call)},
             "job": {"num": number},
         }
-        content = {"seed": number, "preset": {"name": "smoke"}, "tables": ["table_3_4"], "logger": None}
+        seed = number if seed is None else seed
+        content = {"seed": seed, "preset": {"name": "smoke"}, "tables": ["table_3_4"], "logger": None}
         config = OmegaConf.create({"hydra": hydra, "group": None, **content})
         report = SweepReport(tmp_path)
         report.on_job_start(config)
@@ -36,7 +37,8 @@ def end_job(tmp_path):
             returned = JobReturn(cfg=OmegaConf.create(run), status=status)
             returned.return_value = ValueError("broken") if status == JobStatus.FAILED else None
             report.on_job_end(config, returned)
-        return json.loads((tmp_path / "sweeps" / "table_3_4-smoke" / "sweep.json").read_text())["jobs"]
+        index = tmp_path / "sweeps" / "table_3_4-smoke" / "sweep.json"
+        return json.loads(index.read_text())["jobs"] if index.is_file() else []
 
     return end
 
@@ -63,6 +65,23 @@ def test_a_seed_that_ran_again_takes_the_place_of_the_earlier_run(end_job):
     assert sorted(job["run_dir"] for job in jobs) == ["runs/b", "runs/with-another-hash"]
     jobs = end_job("third", 0, "c", typed=("data.observation.num_points=64",))
     assert len(jobs) == 3, "another row"
+
+
+def test_a_swept_key_that_changes_nothing_is_said(end_job, caplog):
+    end_job("first", 0, "a", seed=0, typed=("preset.mesh.learning_rate=1",))
+    assert not caplog.messages
+    end_job("first", 1, "a", seed=0, typed=("preset.mesh.learning_rate=2",))
+    assert "nothing of its experiment depends on preset.mesh.learning_rate=2" in caplog.text
+    caplog.clear()
+    end_job("first", 2, "b", seed=0, typed=("data.observation.num_points=2",))
+    end_job("second", 0, "a", seed=0, typed=("preset.mesh.learning_rate=1",))
+    assert not caplog.messages
+
+
+def test_a_multirun_of_predictions_has_no_table(end_job, tmp_path):
+    assert end_job("first", 0, "a", task="predict") == []
+    assert end_job("second", 0, "a", status=None, task="predict") == []
+    assert not (tmp_path / "sweeps").exists()
 
 
 def test_a_failure_is_kept_among_the_rows_of_a_later_call_until_it_is_mended(end_job):

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from ljn.geometry.rotations import rotmat_to_rotvec, rotvec_to_rotmat
-from ljn.system.smoothing import OneEuro, OneEuroRotation, PoseSmoother, SmoothingSettings
+from ljn.system.smoothing import OneEuro, OneEuroRotation, PoseSmoother, SlowMean, SmoothingSettings
 
 RATE = 30.0
 
@@ -69,3 +69,10 @@ def test_a_smoother_goes_on_from_its_state():
         first(values, 0.0)
     with pytest.raises(ValueError, match=r"joint_beta: expected a number of 0 or more, got -1"):
         SmoothingSettings(joint_beta=-1)
+
+
+def test_a_shape_is_the_mean_of_what_there_is_and_forgets_slowly():
+    values = torch.randn(20, 10, generator=torch.Generator().manual_seed(0))
+    torch.testing.assert_close(smoothed(SlowMean(0.1, 0.0), values)[-1], values.mean(0))
+    changed = torch.cat([values[:1].expand(100, -1), values[1:2].expand(600, -1)])
+    torch.testing.assert_close(smoothed(SlowMean(0.1, 0.0), changed)[-1], values[1], atol=0.01, rtol=0)

@@ -76,8 +76,10 @@ def write_checkpoint(smoke_config, tmp_path_factory):
         content = {"state_dict": module.state_dict(), "epoch": 0}
         config = OmegaConf.to_container(cfg, resolve=True)
         body_hash = "-".join(sorted({*data_hashes, *module.body_hashes}))
-        recipe = build(cfg.data).recipe
-        Provenance(config, body_hash, "none", experiment, recipe).on_save_checkpoint(None, module, content)
+        data = build(cfg.data)
+        detector = None if data.detector_file is None else data.detector_file.read_bytes()
+        provenance = Provenance(config, body_hash, "none", experiment, data.recipe, detector)
+        provenance.on_save_checkpoint(None, module, content)
         path = directory / f"{experiment.replace('/', '_')}.ckpt"
         torch.save(content, path)
         return path

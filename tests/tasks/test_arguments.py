@@ -71,3 +71,14 @@ def test_a_key_of_several_tasks_is_short_in_each():
         match="mesh_ckpt_path: only task=predict, task=ar, task=demo, task=package and task=benchmark read this",
     ):
         prepare_arguments(["task=train", "mesh_ckpt_path=x"])
+
+
+@pytest.mark.parametrize(
+    ("argument", "extra"),
+    [("hydra/launcher=parallel", "sweep"), ("hydra/launcher=slurm", "sweep"), ("sweep=search", "optuna")],
+)
+def test_a_plugin_that_is_missing_is_named_with_its_command(argument, extra, monkeypatch):
+    monkeypatch.setattr("ljn.tasks.arguments.find_spec", lambda name: None)
+    with pytest.raises(ImportError, match=rf"{argument}: .*pip install -e '\.\[{extra}\]'"):
+        prepare_arguments(["-m", argument])
+    assert prepare_arguments(["hydra/launcher=basic"]) == ["hydra/launcher=basic"]

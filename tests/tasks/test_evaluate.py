@@ -1,4 +1,5 @@
 import json
+from pathlib import Path
 
 import pytest
 import torch
@@ -127,6 +128,31 @@ def test_other_bodies_reach_all_that_was_made_of_the_bodies_group(write_checkpoi
     assert (merged.data.body_path, merged.module.body_path) == ("bodies", "bodies")
     assert (merged.data.source.genders, merged.module.genders) == (["male"], ["male"])
     assert merged.module.predicted == "male"
+
+
+def test_a_mesh_checkpoint_carries_the_detector_that_it_was_trained_on(
+    write_checkpoint, smoke_config, tmp_path
+):
+    detector = tmp_path / "detector.ckpt"
+    detector.write_bytes(data := write_checkpoint("detector/basic").read_bytes())
+    path = write_checkpoint("mesh/proposed", f"data.detector_ckpt={detector}")
+    call = smoke_config(tmp_path)
+
+    def found(*typed):
+        return Path(with_checkpoint_config(call, read_checkpoint(path), list(typed)).data.detector_ckpt)
+
+    assert found() == detector
+    detector.write_bytes(b"another one")
+    assert found().read_bytes() == data
+    detector.unlink()
+    assert found().read_bytes() == data
+    assert found().parent == tmp_path / "cache" / "detectors"
+    assert found("data.detector_ckpt=mine.ckpt") == Path("mine.ckpt")
+    content = torch.load(path, weights_only=True)
+    del content["ljn"]["detector"]  # as older checkpoints are
+    torch.save(content, path)
+    with pytest.raises(FileNotFoundError, match=r"no file .*detector\.ckpt'.*data\.detector_ckpt=FILE"):
+        found()
 
 
 def test_refined_meshes_have_metrics_beside_the_others(smoke_config, tmp_path):
