@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 from hydra import compose, initialize_config_dir
+from PIL import Image
 
 from ljn.building import build
 from ljn.geometry.camera import Camera
@@ -87,20 +88,20 @@ def shots_of(recording: Any, every: int) -> Iterator[Shot]:
 
 
 def picture(shots: list[Shot], masks: list[np.ndarray | None]) -> np.ndarray:
-    """Rows of colours, depth and mask, BGR: what is missed magenta, what is too much red."""
+    """Rows of colours, depth and mask, RGB, cut to the middle: what is missed magenta, what is too much red."""
     columns = []
     for shot, mask in zip(shots, masks):
         assert shot.frame.rgb is not None
         assert shot.frame.depth is not None
-        rgb = cv2.cvtColor(shot.frame.rgb, cv2.COLOR_RGB2BGR)
+        rgb, middle = shot.frame.rgb, slice(shot.camera.width // 2 - 140, shot.camera.width // 2 + 120)
         grey = np.clip(255 * (1.2 - shot.frame.depth / 4), 0, 255) * (shot.frame.depth > 0)
         depth = cv2.applyColorMap(grey.astype(np.uint8), cv2.COLORMAP_BONE)
         shown = np.zeros_like(rgb)
         if mask is not None:
             shown[mask] = rgb[mask]
-            shown[mask & ~shot.mask], shown[shot.mask & ~mask] = (0, 0, 255), (255, 0, 255)
-        columns.append(np.vstack([rgb, depth, shown]))
-    return np.hstack(columns)
+            shown[mask & ~shot.mask], shown[shot.mask & ~mask] = (255, 0, 0), (255, 0, 255)
+        columns.append(np.vstack([image[:, middle] for image in (rgb, depth, shown)]))
+    return cv2.resize(np.hstack(columns), None, fx=0.75, fy=0.75, interpolation=cv2.INTER_AREA)
 
 
 def real_shot(folder: Path) -> Shot:
@@ -152,7 +153,8 @@ def main() -> None:
         measure("depthkit_chae (real; nothing but the person)", DepthOnly(), [real_shot(given.real)])
     if given.pictures is not None:
         step = max(1, len(first) // 4)
-        cv2.imwrite(str(given.pictures), picture(first[1::step][:4], first_masks[1::step][:4]))
+        shown = Image.fromarray(picture(first[1::step][:4], first_masks[1::step][:4]))
+        shown.quantize(128).save(given.pictures, optimize=True)
 
 
 if __name__ == "__main__":
