@@ -121,7 +121,11 @@ def _irradiance(normals: np.ndarray, look: Look) -> np.ndarray:
 
 
 class _Cloth:
-    """A curtain's height field and colour on a grid, sampled anywhere."""
+    """A curtain's height field and colour on a grid, sampled anywhere.
+
+    Attributes:
+        colour: `(h, w, 3)` float32, linear RGB, in its light.
+    """
 
     def __init__(
         self, curtain: Curtain, look: Look, floor_m: float, behind_m: float, rng: np.random.Generator
@@ -158,7 +162,7 @@ class _Cloth:
         light *= np.exp(curtain.uneven * uneven)[..., None]
         light *= 1 - _OCCLUDED * np.minimum(self._height / max(curtain.folds_m, 1e-6), 1)[..., None]
         light *= 1 + 0.06 * rng.standard_normal((*height.shape, 1), dtype=np.float32)  # the weave
-        self._colour = (light * curtain.albedo).astype(np.float32)
+        self.colour = (light * curtain.albedo).astype(np.float32)
 
     def meet(self, ray_x: np.ndarray, ray_y: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Depth `(H, W)` where rays meet it, its colour `(H, W, 3)` there, and whether they do `(H, W)`."""
@@ -167,7 +171,7 @@ class _Cloth:
             z = self.behind_m + self._at(self._height, ray_x * z, ray_y * z)
         x, y = ray_x * z, ray_y * z
         is_met = (np.abs(x) < self.half_m) & (y < self.bottom_m) & (y > self.top_m)
-        return z, self._at(self._colour, x, y), is_met
+        return z, self._at(self.colour, x, y), is_met
 
     def _at(self, grid: np.ndarray, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         columns, rows = ((x - self._origin[0]) / _CELL_M, (y - self._origin[1]) / _CELL_M)
@@ -212,6 +216,6 @@ class _Room:
         floor_colour = light * joint * self.tone[board % 64, along.astype(int) % 64]
         if self.cloth is not None:  # what the curtain throws on the floor before it
             near = np.exp(-np.maximum(self.cloth.behind_m - depth, 0) / 0.35)[..., None]
-            floor_colour = floor_colour + 0.25 * near * self.cloth._colour[-1].mean(0)
+            floor_colour = floor_colour + 0.25 * near * self.cloth.colour[-1].mean(0)
         colour[is_floor] = floor_colour[is_floor]
         return colour, depth, kind

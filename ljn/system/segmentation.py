@@ -83,11 +83,12 @@ class GreenCurtain:
             ValueError: The frame has no depth or no colours, the curtain is not there or not green, there is no person
                 or more than one, or the person's clothes are green.
         """
+        self.facts = {}
         depth, rgb = _images(frame, camera)
         green, shares = find_green(rgb)
         is_green = _has_colour(shares, green)
         is_known = _brightest(rgb) > 0
-        self.facts = {"green": round(green.share, 3)}
+        self.facts["green"] = round(green.share, 3)
         curtain = _curtain_depth(depth, is_green, camera)
         is_before = depth > 0
         if curtain is not None:
