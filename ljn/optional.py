@@ -38,3 +38,15 @@ def import_pyrender() -> Any:
         "data.synthesis.renderer=zbuffer"
     )
     return _import("pyrender", fix)
+
+
+def import_driver(name: str, extra: str, needs: str = "") -> Any:
+    """The module of a sensor's driver; an `ImportError` where it is missing.
+
+    Args:
+        name: The module.
+        extra: The extra that installs it.
+        needs: What it needs beside.
+    """
+    more = f". {needs}" if needs else ""
+    return _import(name, f"-e '.[{extra}]'`{more}; or replay a recording with live:replay:PATH")

@@ -27,13 +27,13 @@ def read_lines(path: Path) -> list[str]:
         ValueError: It is no text, or too large.
     """
     if not path.is_file():
-        raise FileNotFoundError(f"no file '{path}'")
+        raise FileNotFoundError(f"input: no file '{path}'")
     try:
         if (size := path.stat().st_size) > _MAX_BYTES:
             raise ValueError(f"{size} bytes, expected at most {_MAX_BYTES}")
         lines = path.read_text(encoding="utf-8-sig").splitlines()
     except READ_ERRORS as error:
-        raise ValueError(f"'{path}' cannot be read ({reason(error)}); write it again") from error
+        raise ValueError(f"input: '{path}' cannot be read ({reason(error)}); write it again") from error
     return [line.strip() for line in lines if line.strip() and not line.lstrip().startswith("#")]
 
 
