@@ -1,15 +1,10 @@
-import json
-from functools import partial
-
-import cv2
 import numpy as np
 import pytest
 
-from ljn.system.readers import LensCamera, Recorder, open_recording
-from ljn.system.readers.cameras import read_lens_camera
+from ljn.system.readers import Recorder, open_recording
 from ljn.system.readers.timestamps import match, since_first
 from ljn.system.recording import RgbdFrame
-from tests.system.readers.conftest import DEPTH_CAMERA, RGB_CAMERA, as_tuples, turned
+from tests.system.readers.conftest import DEPTH_CAMERA, RGB_CAMERA
 from tests.system.readers.test_layouts import integers, write_camera, write_png, write_tum, write_video
 
 
@@ -243,80 +238,6 @@ def test_lists_of_tum_that_are_wrong_are_refused(frames, tmp_path):
         open_recording(tmp_path)
 
 
-# Cameras
-
-
-def test_a_colour_camera_is_read_with_its_lens_and_place(tmp_path):
-    motion = turned(20, [0.05, -0.01, 0.002])
-    x, y, z, w = rotation_as_quaternion(motion[:3, :3])
-    place = {"translation": motion[:3, 3].tolist()}
-    forms = [
-        {"extrinsics": {"rotation": motion[:3, :3].tolist(), **place}},
-        {"extrinsics": {"quaternion_xyzw": [x, y, z, w], **place}},
-        {"extrinsics": {"quaternion_wxyz": [w, x, y, z], **place}},
-        {"extrinsics": {"rgb_from_depth": motion.tolist()}},
-        {"extrinsics": motion.ravel().tolist()},
-        {"rgb_from_depth": motion.tolist()},
-    ]
-    lens = {"distortion_model": "plumb_bob", "distortion_coefficients": [0.1, -0.2, 0.001, 0.002, 0.05]}
-    for form in forms:
-        write_camera(tmp_path / "rgb_camera.yaml", RGB_CAMERA, **lens, **form)
-        found, others = read_lens_camera(tmp_path / "rgb_camera.yaml", is_rgb=True)
-        assert found.camera == RGB_CAMERA
-        assert found.distortion == (0.1, -0.2, 0.001, 0.002, 0.05)
-        np.testing.assert_allclose(found.motion, motion, atol=1e-9)
-        assert others == {}
-    write_camera(tmp_path / "rgb_camera.yaml", RGB_CAMERA)
-    assert read_lens_camera(tmp_path / "rgb_camera.yaml", is_rgb=True)[0] == LensCamera(RGB_CAMERA)
-
-
-def rotation_as_quaternion(turn):
-    from scipy.spatial.transform import Rotation
-
-    return Rotation.from_matrix(turn).as_quat().tolist()
-
-
-SHIFT = {"translation": [0.05, 0, 0]}
-
-
-@pytest.mark.parametrize(
-    ("values", "message"),
-    [
-        ({"extrinsics": {"rotation": [[1, 0], [0, 1]], **SHIFT}}, "rotation: expected 9 numbers"),
-        (
-            {"extrinsics": {"rotation": np.eye(3).tolist(), "translation": [52.0, 0, 0]}},
-            "got 52: millimetres",
-        ),
-        ({"extrinsics": {"rotation": (2 * np.eye(3)).tolist(), **SHIFT}}, "expected a rotation"),
-        ({"extrinsics": {"rotation": np.diag([1.0, 1, -1]).tolist(), **SHIFT}}, "expected a rotation"),
-        ({"extrinsics": {"quaternion_xyzw": [1, 1, 0, 0], **SHIFT}}, "unit quaternion"),
-        ({"extrinsics": {"quaternion": [0, 0, 0, 1], **SHIFT}}, "got quaternion"),
-        ({"extrinsics": {"rotation": np.eye(3).tolist()}}, "translation: expected 3 numbers, got None"),
-        ({"extrinsics": np.eye(4)[:3].tolist()}, "expected 16 numbers"),
-        ({"rgb_from_depth": (np.eye(4) + 1e-3).tolist()}, "last row 0, 0, 0, 1"),
-        ({"extrinsics": "left"}, "expected 16 numbers"),
-        ({"distortion_model": "equidistant", "D": [0.1, 0, 0, 0]}, "'equidistant', a fisheye"),
-        ({"distortion_coefficients": [0.1, 0.2, 0.3]}, "expected 4, 5 or 8 of OpenCV's coefficients"),
-        ({"distortion_coefficients": [0.1] * 12}, "expected 4, 5 or 8"),
-        ({"distortion_coefficients": [0.1, "nan", 0, 0]}, "expected finite numbers"),
-        ({"k1": 0.1}, "k1 are unknown"),
-    ],
-)
-def test_a_wrong_colour_camera_is_refused(values, message, tmp_path):
-    write_camera(tmp_path / "rgb_camera.yaml", RGB_CAMERA, **values)
-    with pytest.raises(ValueError, match=message):
-        read_lens_camera(tmp_path / "rgb_camera.yaml", is_rgb=True)
-
-
-def test_a_depth_camera_has_no_place(tmp_path):
-    write_camera(tmp_path / "camera.yaml", DEPTH_CAMERA, rgb_from_depth=as_tuples(np.eye(4)))
-    with pytest.raises(ValueError, match="rgb_from_depth are unknown"):
-        read_lens_camera(tmp_path / "camera.yaml")
-
-
-# Times
-
-
 def test_each_image_is_matched_once_with_the_nearest_in_time():
     rng = np.random.default_rng(0)
     for _ in range(50):
@@ -338,82 +259,3 @@ def test_times_begin_at_the_first_that_is_known():
     assert since_first([None, 5.0, None, 5.5]) == ([None, 0.0, None, 0.5], {})
     assert since_first([]) == ([], {})
     assert since_first([3.0, 3.0]) == ([0.0, None], {"times_that_go_back": 1})
-
-
-# Anything
-
-
-@pytest.mark.slow
-def test_damaged_recordings_are_read_or_refused(frames, tmp_path, capsys):
-    """Any file of a recording cut, changed or removed: an error of ours or frames, never another."""
-    rng = np.random.default_rng(0)
-    counts, subjects = {"refused": 0, "all frames": 0, "some frames": 0}, set()
-    small = tuple(images[:3] for images in frames)
-
-    def folder(path):
-        motion = LensCamera(RGB_CAMERA, (0.1, 0, 0, 0), as_tuples(turned(1, [0.05, 0, 0])))
-        with Recorder(path, LensCamera(DEPTH_CAMERA, (0.1, 0, 0, 0)), motion) as recorder:
-            for i, depth in enumerate(small[0]):
-                rgb = cv2.resize(small[1][i], (RGB_CAMERA.width, RGB_CAMERA.height))
-                recorder.write(RgbdFrame(i, f"{i}", depth, rgb, i / 10))
-
-    def video(path):
-        with Recorder(path, DEPTH_CAMERA) as recorder:
-            for i, depth in enumerate(small[0]):
-                recorder.write(RgbdFrame(i, f"{i}", depth))
-        write_video(path / "rgb.avi", small[1])
-
-    def arrays(path):
-        (path / "depth").mkdir(parents=True)
-        for i, depth in enumerate(small[0]):
-            np.savez(path / "depth" / f"{i}.npz", depth=depth)
-        c = DEPTH_CAMERA
-        matrix = [c.fx, 0, 0, 0, c.fy, 0, c.cx, c.cy, 1]
-        values = {"width": c.width, "height": c.height, "intrinsic_matrix": matrix, "depth_scale": 1000.0}
-        (path / "intrinsic.json").write_text(json.dumps(values))
-
-    lists = (partial(write_tum, frames=small, is_associated=is_it) for is_it in (True, False))
-    layouts = (folder, video, arrays, *lists)
-    for layout_number, write in enumerate(layouts):
-        path = tmp_path / str(layout_number)
-        write(path)
-        files = sorted(file for file in path.rglob("*") if file.is_file())
-        for _ in range(120):
-            file = files[rng.integers(len(files))]
-            content = file.read_bytes()
-            damaged = bytearray(content)
-            for _ in range(rng.integers(1, 4)):
-                kind = rng.integers(4)
-                if kind == 0 and damaged:
-                    damaged = damaged[: rng.integers(len(damaged))]
-                elif kind == 1 and damaged:
-                    for place in rng.integers(0, len(damaged), rng.integers(1, 30)):
-                        damaged[place] = rng.integers(256)
-                elif kind == 2:
-                    place = rng.integers(len(damaged) + 1)
-                    damaged[place:place] = rng.bytes(rng.integers(1, 20))
-                elif len(damaged) > 40:
-                    start = rng.integers(len(damaged) - 30)
-                    del damaged[start : start + rng.integers(1, 30)]
-            if rng.integers(15) == 0:
-                file.unlink()
-            else:
-                file.write_bytes(damaged)
-            try:
-                recording = open_recording(path)
-                found = list(recording.frames())
-                assert len(found) == recording.num_frames
-                for frame in found:
-                    assert (frame.depth is None) <= (frame.error is not None)
-                    if frame.depth is not None:
-                        assert np.isfinite(frame.depth).all()
-                whole = all(frame.error is None for frame in found)
-                counts["all frames" if whole else "some frames"] += 1
-            except (ValueError, FileNotFoundError) as error:
-                counts["refused"] += 1
-                subjects.add(str(error).partition(":")[0])
-            file.write_bytes(content)
-    with capsys.disabled():
-        print(f"\ndamaged recordings: {counts}")
-    assert min(counts.values()) > 0
-    assert subjects <= {"input", "camera", "rgb", "depth", "timestamps", "depth_scale", "fps"}
