@@ -26,7 +26,7 @@ def open_recording(
     """A recording, whose layout is recognised by what is there, or a camera that records now.
 
     Args:
-        path: Its folder; a RealSense camera's `.bag`; `live:realsense`, `live:azure` or `live:kinect2`; or
+        path: Its folder; a RealSense camera's `.bag` or `.db3`; `live:realsense`, `live:azure` or `live:kinect2`; or
             `live:replay:PATH`, a recording's frames as they would come from a camera.
         camera: The depth camera, or its file; None for that in the folder.
         rgb_camera: The colour camera, or its file; None for that in the folder, or for colours that are registered to
@@ -47,7 +47,7 @@ def open_recording(
                 "camera: a live camera says itself what it is; leave out camera, rgb_camera, depth_scale"
             )
         return open_live(source, lambda files: _open_files(files, camera, rgb_camera, depth_scale))
-    if Path(path).suffix == ".bag" and Path(path).is_file():
+    if Path(path).suffix in (".bag", ".db3") and Path(path).is_file():
         from ljn.system.readers.realsense import RealSense
 
         return LiveRecording(RealSense(Path(path)))
@@ -62,5 +62,5 @@ def _open_files(
     for is_layout, open_layout, _ in _LAYOUTS:
         if path.is_dir() and is_layout(path):
             return open_layout(path, camera, rgb_camera, depth_scale)
-    sought = "; or ".join([*(text for _, _, text in _LAYOUTS), "a RealSense camera's .bag"])
+    sought = "; or ".join([*(text for _, _, text in _LAYOUTS), "a RealSense camera's .bag or .db3"])
     raise ValueError(f"input: '{path}' is no recording: looked for {sought}")

@@ -104,10 +104,21 @@ def _first_of(folder: Path, names: Iterable[str]) -> Path | None:
 
 
 def find_images(folder: Path, suffixes: Sequence[str]) -> dict[str, Path]:
-    """The images of a folder by stem, in the order of the numbers in their names."""
-    paths = (path for path in folder.iterdir() if path.suffix.lower() in suffixes)
-    # Files that programs leave behind, such as macOS's ._0001.png, are no images.
-    found = {path.stem: path for path in paths if not path.name.startswith(".")}
+    """The images of a folder by stem, in the order of the numbers in their names.
+
+    Raises:
+        ValueError: Two share a stem.
+    """
+    found: dict[str, Path] = {}
+    for path in sorted(folder.iterdir()):
+        # Files that programs leave behind, such as macOS's ._0001.png, are no images.
+        if path.suffix.lower() not in suffixes or path.name.startswith("."):
+            continue
+        if path.stem in found:
+            raise ValueError(
+                f"input: '{found[path.stem].name}' and '{path.name}' in '{folder}' are of one frame; keep one of them"
+            )
+        found[path.stem] = path
     return {stem: found[stem] for stem in sorted(found, key=natural_key)}
 
 

@@ -120,7 +120,12 @@ class LiveRecording:
                     raw = self._sensor.read()
                 except SensorStopped as stopped:
                     self._facts["ended"] = str(stopped)
-                    _log.warning("%s: %s", self.name, stopped)
+                    _log.log(
+                        logging.INFO if self._sensor.is_file else logging.WARNING,
+                        "%s: %s",
+                        self.name,
+                        stopped,
+                    )
                     return
                 except ValueError as error:
                     self._num_unreadable += 1

@@ -1,5 +1,6 @@
-"""Intel's RealSense cameras, live or from the `.bag` files that they record, through pyrealsense2."""
+"""Intel's RealSense cameras, live or from the `.bag` or `.db3` files that they record, through pyrealsense2."""
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -64,30 +65,68 @@ class RealSense:
             self.close()
             raise
         self.is_file = bag is not None
+        self._is_over = False
+        self._latest: int | None = None  # depth image, by the driver's number
+        self._following: Any = None  # of a file, the set after the one that was given
         self.name = "realsense" if bag is None else bag.stem
-        self.facts: dict[str, object] = {**({"layout": "RealSense .bag"} if bag else {}), "sensor": model}
+        self.facts: dict[str, object] = {
+            **({"layout": f"RealSense {bag.suffix}"} if bag else {}),
+            "sensor": model,
+        }
 
     def read(self) -> RawFrame:
-        """See `Sensor`."""
-        is_there, frames = self._pipeline.try_wait_for_frames(int(1000 * TIMEOUT_S))
-        if not is_there:
-            why = "the file is over" if self.is_file else f"no frame for {TIMEOUT_S:g} s: was it unplugged?"
-            raise SensorStopped(why)
-        depth, rgb = frames.get_depth_frame(), frames.get_color_frame()
+        """See `Sensor`; of sets with one depth image, that with the colours nearest in time, or, live, the first."""
+        chosen, self._following = self._following or self._wait(), None
+        while (number := _depth_number(chosen)) is not None and number == self._latest:
+            chosen = self._wait()
+        self._latest = number
+        if self.is_file and not self._is_over:
+            try:
+                while _depth_number(following := self._wait()) == number:
+                    chosen = min(chosen, following, key=_apart_ms)
+                self._following = following
+            except SensorStopped:
+                pass  # after this frame
+        depth, rgb = chosen.get_depth_frame(), chosen.get_color_frame()
         if not depth or not rgb:
             raise ValueError(f"the sensor gave a frame without {'colours' if depth else 'depth'}")
-        # Its memory is used again.
         return RawFrame(
             metres(np.asanyarray(depth.get_data()), self._scale),
-            np.array(rgb.get_data(), np.uint8),
+            np.array(rgb.get_data(), np.uint8),  # a copy: the driver uses its memory again
             depth.get_timestamp() / 1000,
         )
+
+    def _wait(self) -> Any:
+        """The next set of images; raises `SensorStopped` where none comes."""
+        why = "the file is over" if self.is_file else f"no frame for {TIMEOUT_S:g} s: was it unplugged?"
+        if self._is_over:
+            raise SensorStopped(why)
+        try:
+            is_there, frames = self._pipeline.try_wait_for_frames(int(1000 * TIMEOUT_S))
+        except RuntimeError as error:
+            is_there, why = False, f"the sensor failed ({reason(error)}): was it unplugged?"
+        if not is_there:
+            self._is_over = True
+            raise SensorStopped(why)
+        return frames
 
     def close(self) -> None:
         """See `Sensor`."""
         if self._is_open:
             self._is_open = False
             self._pipeline.stop()
+
+
+def _depth_number(frames: Any) -> int | None:
+    """The driver's number of a set's depth image; None where there is none."""
+    depth = frames.get_depth_frame()
+    return depth.get_frame_number() if depth else None
+
+
+def _apart_ms(frames: Any) -> float:
+    """Between a set's depth image and its colours."""
+    depth, rgb = frames.get_depth_frame(), frames.get_color_frame()
+    return abs(depth.get_timestamp() - rgb.get_timestamp()) if depth and rgb else math.inf
 
 
 def _camera(intrinsics: Any) -> LensCamera:

@@ -110,6 +110,13 @@ def test_images_without_a_partner_are_marked_in_their_place(walk):
     assert recording.facts["frames_without_depth"] == recording.facts["frames_without_colours"] == 1
 
 
+def test_two_images_of_one_frame_are_refused(walk, frames):
+    np.save(walk / "depth" / "0002.npy", frames[0][0])
+    (walk / "depth" / "._0003.png").write_bytes(b"left behind")
+    with pytest.raises(ValueError, match=r"'0002\.npy' and '0002\.png' in .* are of one frame"):
+        open_recording(walk)
+
+
 def test_images_without_any_common_name_or_number_are_refused(walk):
     for number, path in enumerate(sorted((walk / "rgb").iterdir())):
         path.rename(path.with_name(f"{100 + number}.png"))
@@ -179,10 +186,11 @@ def test_times_that_go_back_are_not_known_and_jumps_are_counted(walk):
         ),
         ("0001,soon", "expected lines NAME,SECONDS in .* got 'soon'"),
         ("0001,inf", "got 'inf'"),
-        ("\0" * 2**25, "expected at most"),
+        ("0\n" * 3000, "6000 bytes, expected at most 5000"),
     ],
 )
-def test_timestamps_that_are_none_are_refused(walk, text, message):
+def test_timestamps_that_are_none_are_refused(walk, text, message, monkeypatch):
+    monkeypatch.setattr("ljn.system.readers.timestamps._MAX_BYTES", 5000)
     (walk / "timestamps.csv").write_text(text)
     with pytest.raises(ValueError, match=message):
         open_recording(walk)
@@ -202,6 +210,10 @@ def test_timestamps_that_are_too_few_are_left_out_or_missing(walk):
     assert times[:3] == [None] * 3
     assert times[3:5] == pytest.approx([0, 0.1])
     assert "no time for 4 of 6" in recording.facts["timestamps"]
+    (walk / "timestamps.csv").write_text("\n".join(f"{i} {i / 5}" for i in range(6)))  # numbers of its own
+    assert [frame.timestamp_s for frame in open_recording(walk).frames()] == pytest.approx(
+        [i / 5 for i in range(6)]
+    )
 
 
 def test_depth_in_another_unit_is_refused(frames, tmp_path):

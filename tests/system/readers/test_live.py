@@ -48,6 +48,9 @@ class FakeImage(Fake):
     def get_timestamp(self):
         return self.time_ms
 
+    def get_frame_number(self):
+        return self.number
+
     def __bool__(self):
         return self.image is not None
 
@@ -58,7 +61,10 @@ def intrinsics(camera, model="brown_conrady", coeffs=(0.0,) * 5):
     return Fake(**size, **place, model=f"distortion.{model}", coeffs=list(coeffs))
 
 
-def fake_realsense(monkeypatch, raw, num_frames=4, model="inverse_brown_conrady", damaged=()):
+ALL = [(i, i) for i in range(4)]  # numbers of depth and colours that come together
+
+
+def fake_realsense(monkeypatch, raw, sets=ALL, model="inverse_brown_conrady", damaged=()):
     module = ModuleType("pyrealsense2")
     module.opened = []
 
@@ -91,14 +97,14 @@ def fake_realsense(monkeypatch, raw, num_frames=4, model="inverse_brown_conrady"
 
         def try_wait_for_frames(self, timeout_ms):
             assert self.is_running
-            if self.number == num_frames:
+            if self.number == len(sets):
                 return False, None
+            number, rgb_number = sets[self.number]
             self.number += 1
-            image = None if self.number - 1 in damaged else raw[1]
-            depth = FakeImage(image=raw[0], time_ms=5000 + 100.0 * self.number)
-            return True, Fake(
-                get_depth_frame=give(depth), get_color_frame=give(FakeImage(image=image, time_ms=0))
-            )
+            depth = FakeImage(image=raw[0], time_ms=5000 + 100.0 * number, number=number)
+            image = None if rgb_number in damaged else raw[1] if number == rgb_number else 0 * raw[1]
+            rgb = FakeImage(image=image, time_ms=5003 + 100.0 * rgb_number, number=rgb_number)
+            return True, Fake(get_depth_frame=give(depth), get_color_frame=give(rgb))
 
         def stop(self):
             self.is_running = False
@@ -156,16 +162,27 @@ def test_a_sensor_is_closed_when_its_frames_are_no_longer_taken(monkeypatch, raw
     assert not driver.opened[0].is_running
 
 
-def test_a_bag_is_a_recording_that_can_be_begun_later(monkeypatch, raw, tmp_path):
-    driver = fake_realsense(monkeypatch, raw)
+def test_a_bag_is_a_recording_that_can_be_begun_later(monkeypatch, raw, registered, tmp_path):
+    # As the driver plays them: a depth image comes with the colours before it, and again with its own.
+    sets = [(0, 0), (1, 0), (1, 1), (1, 2), (2, 2), (3, 2), (3, 3)]
+    driver = fake_realsense(monkeypatch, raw, sets)
     (tmp_path / "walk.bag").write_bytes(b"#ROSBAG V2.0")
     recording = open_recording(tmp_path / "walk.bag")
     assert driver.opened[0].config.file.endswith("walk.bag")
     assert recording.name == "walk"
-    found = list(recording.frames(2))
-    assert [frame.number for frame in found] == [2, 3]
-    assert found[0].timestamp_s == pytest.approx(0.2)
+    found = list(recording.frames(1))
+    assert [frame.number for frame in found] == [1, 2, 3]
+    np.testing.assert_allclose([frame.timestamp_s for frame in found], [0.1, 0.2, 0.3])
+    for frame in found:
+        np.testing.assert_array_equal(frame.rgb, registered)
     assert recording.facts["ended"] == "the file is over"
+    assert recording.facts["layout"] == "RealSense .bag"
+
+
+def test_a_sensor_gives_no_depth_image_twice(monkeypatch, raw):
+    fake_realsense(monkeypatch, raw, [(0, 0), (0, 1), (1, 1), (1, 2)])
+    found = list(open_recording("live:realsense").frames())
+    assert [frame.number for frame in found] == [0, 1]
 
 
 def test_a_realsense_that_is_not_there_or_not_known_is_an_error(monkeypatch, raw):
