@@ -1,6 +1,7 @@
 """Intel's RealSense cameras, live or from the `.bag` or `.db3` files that they record, through pyrealsense2."""
 
 import math
+from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
@@ -50,7 +51,9 @@ class RealSense:
         try:
             device = profile.get_device()
             if bag is not None:
-                device.as_playback().set_real_time(False)  # all frames, however slowly they are taken
+                playback = device.as_playback()
+                playback.set_real_time(False)  # all frames, however slowly they are taken
+                playback.seek(timedelta(0))  # some may have passed by since it was started
             depth = profile.get_stream(rs.stream.depth).as_video_stream_profile()
             rgb = profile.get_stream(rs.stream.color).as_video_stream_profile()
             self._scale = 1 / float(device.first_depth_sensor().get_depth_scale())

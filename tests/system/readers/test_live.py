@@ -91,7 +91,7 @@ def fake_realsense(monkeypatch, raw, sets=ALL, model="inverse_brown_conrady", da
             device = Fake(
                 first_depth_sensor=give(Fake(get_depth_scale=give(0.001))),
                 get_info=give("Intel RealSense D455"),
-                as_playback=give(Fake(set_real_time=give(None))),
+                as_playback=give(Fake(set_real_time=give(None), seek=give(None))),
             )
             return Fake(get_device=give(device), get_stream=profiles.get)
 
