@@ -77,7 +77,7 @@ def find_cameras(
     else:
         path = Path(rgb_camera) if rgb_camera else _first_of(folder, _RGB_CAMERA_NAMES)
         colour_camera = read_lens_camera(path, is_rgb=True)[0] if path else None
-    scale = depth_scale or others.get("depth_scale") or default_scale
+    scale = others.get("depth_scale", default_scale) if depth_scale is None else depth_scale
     fps = others.get("fps")
     return Cameras(
         depth_camera,
