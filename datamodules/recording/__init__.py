@@ -2,5 +2,6 @@
 
 from datamodules.recording.stage import Curtain
 from datamodules.recording.synthetic import SyntheticRecording, Truth
+from datamodules.recording.writing import write_recording
 
-__all__ = ["Curtain", "SyntheticRecording", "Truth"]
+__all__ = ["Curtain", "SyntheticRecording", "Truth", "write_recording"]

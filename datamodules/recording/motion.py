@@ -1,5 +1,6 @@
 """A clip of motion, made ready to stand before a camera."""
 
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -7,6 +8,7 @@ import torch
 
 from datamodules.sources.embedded import EmbeddedSource
 from datamodules.sources.embedded.joint_limits import with_square_elbows
+from datamodules.sources.embedded.records import ClipMixture
 from ljn.body.skeleton import NUM_JOINTS, ROOT
 from ljn.geometry.rotations import rotation_about, rotmat_to_rotvec, rotvec_to_rotmat, smpl_pose_to_body_world
 
@@ -40,7 +42,7 @@ def embedded_motion(
     Raises:
         ValueError: No such clip or frame.
     """
-    mixture = EmbeddedSource().mixture
+    mixture = _embedded()
     clips = [name for name in dict.fromkeys(mixture.clips.clip.tolist()) if name in mixture.split[SPLIT]]
     if clip not in clips:
         raise ValueError(f"clip: expected one of the {SPLIT} split's ({', '.join(clips)}), got '{clip}'")
@@ -57,3 +59,8 @@ def embedded_motion(
     turn = np.deg2rad(heading_deg) - torch.atan2(forward[1], forward[0])
     rotmat[:, ROOT] = rotation_about("z", turn) @ rotmat[:, ROOT]
     return Motion(clip, rotmat_to_rotvec(rotmat).flatten(-2).numpy())
+
+
+@lru_cache(maxsize=1)
+def _embedded() -> ClipMixture:
+    return EmbeddedSource().mixture

@@ -8,6 +8,8 @@ _TRIED, _POINTS = 120, 1500
 _TILT = np.cos(np.deg2rad(35))
 """Between the floor's normal and the image's vertical, at most."""
 _LEAST_SHARE, _LEAST_POINTS = 0.15, 60
+_WIDTH_M = 0.9
+"""More than a person's clothes are wide."""
 _BELOW = 0.04
 """Share of the points that may lie under a floor: of noise and reflections."""
 
@@ -67,6 +69,9 @@ def find_floor(depth: np.ndarray, camera: Camera) -> np.ndarray | None:
         normal = np.linalg.eigh((points[on] - middle).T @ (points[on] - middle))[1][:, 0]
         normal = normal * -np.sign(normal[1])
         offset = -normal @ middle
+    on = np.abs(points @ normal + offset) < tolerance[:, 0]
+    if np.ptp(np.percentile(points[on, 0], [5, 95])) < _WIDTH_M:
+        return None
     return np.append(normal, offset)
 
 
