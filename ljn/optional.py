@@ -49,3 +49,15 @@ def import_pyrender() -> Any:
 def import_viser() -> Any:
     """The `viser` module; an `ImportError` where it is missing."""
     return _import("viser", "-e '.[view]'`; or do without the live view: task.view=false")
+
+
+def import_driver(name: str, extra: str, needs: str = "") -> Any:
+    """The module of a sensor's driver; an `ImportError` where it is missing.
+
+    Args:
+        name: The module.
+        extra: The extra that installs it.
+        needs: What it needs beside.
+    """
+    more = f". {needs}" if needs else ""
+    return _import(name, f"-e '.[{extra}]'`{more}; or replay a recording with live:replay:PATH")

@@ -149,7 +149,7 @@ def test_the_training_camera_is_read_from_the_configuration(kinect):
         ("fx: 1\nfy: 1", "cx, cy, width, height are missing"),
         (
             "fx: 1\nfy: 1\ncx: 1\ncy: 1\nwidth: 9\nheight: 9\nk1: 0.1",
-            "k1 are unknown .a distortion is a list",
+            "k1 are unknown .a distortion is given as",
         ),
         ("fx: [1]\nfy: 1\ncx: 1\ncy: 1\nwidth: 9\nheight: 9", r"fx: expected a finite number.*got \[1\]"),
         ("fx: 1\nfy: wide\ncx: 1\ncy: 1\nwidth: 9\nheight: 9", "fy: expected a finite number.*got 'wide'"),

@@ -71,7 +71,7 @@ class LensCamera:
     @property
     def intrinsics(self) -> np.ndarray:
         """`(4,)`: fx, fy, cx, cy, pixels."""
-        return np.array([self.camera.fx, self.camera.fy, self.camera.cx, self.camera.cy])
+        return np.array([self.camera.fx, self.camera.fy, self.camera.cx, self.camera.cy], np.float64)
 
 
 def read_lens_camera(

@@ -77,7 +77,7 @@ def find_cameras(
     else:
         path = Path(rgb_camera) if rgb_camera else _first_of(folder, _RGB_CAMERA_NAMES)
         colour_camera = read_lens_camera(path, is_rgb=True)[0] if path else None
-    scale = depth_scale or others.get("depth_scale") or default_scale
+    scale = others.get("depth_scale", default_scale) if depth_scale is None else depth_scale
     fps = others.get("fps")
     return Cameras(
         depth_camera,
@@ -104,10 +104,21 @@ def _first_of(folder: Path, names: Iterable[str]) -> Path | None:
 
 
 def find_images(folder: Path, suffixes: Sequence[str]) -> dict[str, Path]:
-    """The images of a folder by stem, in the order of the numbers in their names."""
-    paths = (path for path in folder.iterdir() if path.suffix.lower() in suffixes)
-    # Files that programs leave behind, such as macOS's ._0001.png, are no images.
-    found = {path.stem: path for path in paths if not path.name.startswith(".")}
+    """The images of a folder by stem, in the order of the numbers in their names.
+
+    Raises:
+        ValueError: Two share a stem.
+    """
+    found: dict[str, Path] = {}
+    for path in sorted(folder.iterdir()):
+        # Files that programs leave behind, such as macOS's ._0001.png, are no images.
+        if path.suffix.lower() not in suffixes or path.name.startswith("."):
+            continue
+        if path.stem in found:
+            raise ValueError(
+                f"input: '{found[path.stem].name}' and '{path.name}' in '{folder}' are of one frame; keep one of them"
+            )
+        found[path.stem] = path
     return {stem: found[stem] for stem in sorted(found, key=natural_key)}
 
 
@@ -284,21 +295,21 @@ class FileRecording:
             raise ValueError(
                 f"input: no frame of '{self._path}' has both depth and colours: give them one name"
             )
-        errors = []
+        errors, is_readable = [], False
         # A video is decoded from its beginning: its first frames alone.
         probes = whole[:_PROBES] if self._video else whole[:: max(1, len(whole) // _PROBES)]
-        frames = self.chosen_frames(probes)
-        for frame in frames:
-            if frame.error is None:
-                assert frame.depth is not None
-                check_unit(frame.depth, self._path)
+        for frame in self.chosen_frames(probes):
+            if frame.error is not None:
+                errors.append(frame.error)
+                continue
+            is_readable = True
+            path = self._entries[frame.number].depth
+            if path is not None and _is_plausible(path, self._cameras.depth_scale):
                 break
-            errors.append(frame.error)
-        else:
+        if not is_readable:
             raise ValueError(
                 f"input: none of {len(errors)} frames of '{self._path}' can be read: {errors[0]}"
             )
-        frames.close()  # type: ignore[attr-defined]
         self._unreadable.clear()
 
 
@@ -326,14 +337,24 @@ def metres(depth: np.ndarray, depth_scale: float = MILLIMETRES) -> np.ndarray:
     return found
 
 
-def check_unit(depth: np.ndarray, path: Path) -> None:
-    """Raise `ValueError` where a depth image `(H, W)`, metres, measures what no depth camera does."""
-    measured = depth[depth > 0]
-    if len(measured) and (median := float(np.median(measured))) < _NEAREST_M:
-        raise ValueError(
-            f"depth: half of the first frame of '{path}' is nearer than {median:g} m: another unit? Integers are "
-            "millimetres unless depth_scale says how many are a metre (5000 in TUM's files), floats metres"
-        )
+def _is_plausible(path: Path, depth_scale: float) -> bool:
+    """Whether a depth image measures what a depth camera does; False where it measures nothing.
+
+    Raises:
+        ValueError: Its unit is probably another one.
+    """
+    depth = read_depth(path)
+    is_integer = depth.dtype.kind in "iu"
+    measured = depth[(depth > 0) & (depth < (_INVALID if is_integer else np.inf))]
+    if not measured.size:
+        return False
+    median = float(np.median(measured)) / (depth_scale if is_integer else 1)
+    if _NEAREST_M < median < _FARTHEST_M:
+        return True
+    raise ValueError(
+        f"depth: half of '{path}' is nearer than {median:g} m: another unit? Integers are millimetres unless "
+        "depth_scale says how many are a metre (5000 in TUM's files), floats metres"
+    )
 
 
 def _shown(size: tuple[int, ...]) -> str:

@@ -16,6 +16,7 @@ _UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _LONGEST_S = 5.0  # between two frames as a rule; more is probably another unit
 _JUMP = 5.0  # times the usual interval
 _MAX_BYTES = 2**24
+_LINE = re.compile(r"(?:(.*?)[,;\s]+)?([^,;\s]*)")
 _HEADER = re.compile(r"(?:time|timestamp)s?(?:_(s|ms|us|ns))?", re.IGNORECASE)
 
 
@@ -27,13 +28,13 @@ def read_lines(path: Path) -> list[str]:
         ValueError: It is no text, or too large.
     """
     if not path.is_file():
-        raise FileNotFoundError(f"no file '{path}'")
+        raise FileNotFoundError(f"input: no file '{path}'")
     try:
         if (size := path.stat().st_size) > _MAX_BYTES:
             raise ValueError(f"{size} bytes, expected at most {_MAX_BYTES}")
         lines = path.read_text(encoding="utf-8-sig").splitlines()
     except READ_ERRORS as error:
-        raise ValueError(f"'{path}' cannot be read ({reason(error)}); write it again") from error
+        raise ValueError(f"input: '{path}' cannot be read ({reason(error)}); write it again") from error
     return [line.strip() for line in lines if line.strip() and not line.lstrip().startswith("#")]
 
 
@@ -46,29 +47,29 @@ def read_timestamps(path: Path, names: Sequence[str]) -> tuple[list[float | None
     Raises:
         ValueError: It cannot be read, a time is no number, or the times are in another unit than they say.
     """
-    rows = [re.split(r"[,;\s]+", line.strip(",; ")) for line in read_lines(path)]
+    rows = [_LINE.fullmatch(line.rstrip(",; ")) for line in read_lines(path)]
+    lines = [(row[1], row[2]) for row in rows if row]
     factor, is_named = 1.0, False
-    if rows and (header := _HEADER.fullmatch(rows[0][-1])):
+    if lines and (header := _HEADER.fullmatch(lines[0][1])):
         is_named = bool(header[1])
         factor = _UNITS[(header[1] or "s").lower()]
-        rows = rows[1:]
-    times = [_number(row[-1], path) for row in rows]
-    times = [None if time is None else time * factor for time in times]
+        lines = lines[1:]
+    numbers = [_number(text, path) for _, text in lines]
+    times = [None if time is None else time * factor for time in numbers]
     known = [time for time in times if time is not None]
     if not is_named and len(known) > 1 and abs(np.median(np.diff(known))) > _LONGEST_S:
         raise ValueError(
             f"timestamps: expected seconds in '{path}', got {known[0]:g}, {known[1]:g}, ...: name their unit in a "
             "first line, such as name,timestamp_ms"
         )
-    if rows and all(len(row) > 1 for row in rows):
-        # As a name: the file's, with or without its folder and suffix.
-        of_name = {
-            Path(row[0]).stem if row[0] not in names else row[0]: time for row, time in zip(rows, times)
-        }
+    # As a name: the file's, with or without its folder and suffix.
+    of_name = dict(zip((name for name, _ in lines), times)) | {
+        Path(name).stem: time for (name, _), time in zip(lines, times) if name
+    }
+    if any(name in of_name for name in names):
         found = [of_name.get(name) for name in names]
-        if missing := found.count(None):
-            return found, f"'{path.name}' has no time for {missing} of {len(names)} frames"
-        return found, ""
+        missing = found.count(None)
+        return found, f"'{path.name}' has no time for {missing} of {len(names)} frames" if missing else ""
     if len(times) != len(names):
         remark = f"'{path.name}' has {len(times)} times for {len(names)} frames, and names none: left out"
         return [None] * len(names), remark

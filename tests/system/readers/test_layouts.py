@@ -94,14 +94,6 @@ def write_numbered(folder, frames):
     write_camera(folder / "camera.yml")
 
 
-def write_rs_convert(folder, frames):
-    for i, (depth, rgb) in enumerate(zip(*frames)):
-        time = 1567433000000 + 1000 * TIMES[i]
-        write_png(folder / f"out_Color_{time + 9:.2f}.png", rgb)
-        write_png(folder / f"out_Depth_{time:.2f}.png", integers(depth))
-    write_camera(folder / "camera.yaml")
-
-
 LAYOUTS = {
     "folder": write_folder,
     "arrays": write_arrays,
