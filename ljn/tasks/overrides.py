@@ -40,7 +40,9 @@ def with_checkpoint_config(cfg: DictConfig, checkpoint: Checkpoint, overrides: l
         ValueError: An override is about something that the checkpoint decides.
     """
     plain: dict[str, Any] = OmegaConf.to_container(cfg, resolve=False)  # type: ignore[assignment]
+    new = _newer_keys(plain["data"], checkpoint.config["data"])
     plain |= {name: _with_call(checkpoint.config[name], plain[name], name) for name in CONFIG_GROUPS}
+    plain["data"] |= new
     merged = OmegaConf.create(plain)
     OmegaConf.set_struct(merged, True)
     for start, key in _WHOLE.items():
@@ -49,6 +51,15 @@ def with_checkpoint_config(cfg: DictConfig, checkpoint: Checkpoint, overrides: l
     apply_overrides(merged, [line for line in overrides if not line.startswith(tuple(_WHOLE))])
     _find_detector(merged, checkpoint)
     return merged
+
+
+def _newer_keys(call: Mapping[str, Any], stored: Mapping[str, Any]) -> dict[str, None]:
+    """The keys that data of a checkpoint's kind did not have yet when it was trained: null, which changes nothing."""
+    is_same_kind = call.get("_target_") == stored.get("_target_")
+    decides = Key.RUN | Key.THROUGH
+    return {
+        key: None for key in call if is_same_kind and key not in stored and kind_of(f"data.{key}") & decides
+    }
 
 
 def _find_detector(cfg: DictConfig, checkpoint: Checkpoint) -> None:

@@ -104,7 +104,7 @@ def test_a_source_is_chosen_as_a_whole_and_has_the_checkpoints_bodies(trained, s
     assert merged.data.source.genders == ["male"]
     typed = ["data/source=mixed", "data.source.weights.npz=2", "body.genders=[neutral]"]
     merged = with_checkpoint_config(evaluation(smoke_config, trained, tmp_path, *typed), checkpoint, typed)
-    assert merged.data.source.weights == {"embedded": 1, "amass": 0, "bvh": 0, "npz": 2}
+    assert merged.data.source.weights == {"embedded": 1, "amass": 0, "bvh": 0, "npz": 2, "surreal": 0}
     assert all(source.genders == ["neutral"] for source in merged.data.source.sources.values())
 
 
