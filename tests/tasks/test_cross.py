@@ -83,6 +83,7 @@ def test_a_mistake_in_the_changes_is_an_error_before_the_training(smoke_config, 
     assert not (tmp_path / "runs").exists()
 
 
+@pytest.mark.slow
 def test_the_detector_of_a_chain_is_for_its_test_alone(smoke_config, monkeypatch, tmp_path):
     shared = ["preset=smoke", "logger=csv", "callbacks.pictures=null", f"paths.output_dir={tmp_path}"]
     shared += ["data.num_workers=0", "preset.num_train=8", "preset.num_test=8", "preset.num_val=8"]

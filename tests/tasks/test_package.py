@@ -117,6 +117,7 @@ def test_a_run_s_record_goes_into_its_package(trained, smoke_config, tmp_path):
     assert tested["test/mpjpe"] == pytest.approx(metrics["test/mpjpe"], rel=1e-2)
 
 
+@pytest.mark.slow
 def test_a_package_s_mesh_is_tested_on_its_detectors_joints(shipped, smoke_config, tmp_path, monkeypatch):
     call = ("task=evaluate", "weights=small")
     assert "test/mpjpe" in evaluate(smoke_config(tmp_path, *call))
@@ -261,6 +262,7 @@ def test_a_keypoint_detector_is_a_package_of_its_own_and_finds_keypoints_in_pred
         package(smoke_config(tmp_path, "task=package", *given, *checkpoints, "task.licence=CC0-1.0"))
 
 
+@pytest.mark.slow
 def test_a_keypoint_detector_of_colours_needs_the_colour_image(
     models, write_checkpoint, smoke_config, image, tmp_path
 ):
