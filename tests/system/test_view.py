@@ -34,6 +34,7 @@ def test_the_page_is_served_and_shows_frames_that_went_well_and_that_failed(resu
         assert b"<html" in page.lower()
 
 
+@pytest.mark.browser
 @pytest.mark.slow
 def test_a_browser_draws_the_person(result, tmp_path):
     browser = shutil.which("chromium") or shutil.which("google-chrome")
