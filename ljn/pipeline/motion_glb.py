@@ -14,6 +14,7 @@ from ljn.body.skeleton import JOINT_NAMES, NUM_JOINTS, PARENTS, ROOT
 from ljn.body.smpl import SMPL
 from ljn.geometry.rotations import BODY_TO_OPENGL
 from ljn.pipeline.motion import BodyMotion
+from ljn.render.shading import vertex_normals
 from ljn.runs.files import write_atomically
 
 _NUM_WEIGHTS = 4  # of a vertex, which is what glTF has room for
@@ -54,10 +55,12 @@ def write_glb(path: Path, motion: BodyMotion, body: SMPL) -> None:
     bind = np.tile(np.eye(4), (NUM_JOINTS, 1, 1))
     bind[:, :3, 3] = -motion.rest_joints
 
+    normals = vertex_normals(rest, faces)
+    normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     buffer = _Buffer()
     attributes = {
         "POSITION": buffer.add(rest, _FLOAT, _VERTICES, bounds=True),
-        "NORMAL": buffer.add(_normals(rest, faces), _FLOAT, _VERTICES),
+        "NORMAL": buffer.add(normals, _FLOAT, _VERTICES),
         "JOINTS_0": buffer.add(strongest, _BYTE, _VERTICES),
         "WEIGHTS_0": buffer.add(shares, _FLOAT, _VERTICES),
     }
@@ -96,16 +99,6 @@ def write_glb(path: Path, motion: BodyMotion, body: SMPL) -> None:
         **buffer.content,
     }
     write_atomically(path, _packed(content, bytes(buffer.data)))
-
-
-def _normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """`(V, 3)`, unit vectors."""
-    corners = vertices[faces]
-    of_faces = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normals = np.zeros_like(vertices)
-    for corner in range(3):
-        np.add.at(normals, faces[:, corner], of_faces)
-    return normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
 
 
 class _Buffer:

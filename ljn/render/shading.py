@@ -30,11 +30,7 @@ def shade_mesh(
     Returns:
         `(H, W, 3)` RGB in 0-1.
     """
-    corners = vertices[faces]
-    face_normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    normals = np.zeros((len(vertices), 3))
-    for corner in range(3):
-        np.add.at(normals, faces[:, corner], face_normals)
+    normals = vertex_normals(vertices, faces)
     seen = get_renderer("zbuffer").fragments(
         torch.from_numpy(np.ascontiguousarray(vertices, dtype=np.float64))[None], torch.tensor(faces), camera
     )
@@ -49,3 +45,18 @@ def shade_mesh(
     picture[:] = background
     picture[is_mesh] = albedo * (0.25 + 0.75 * light)[..., None]
     return picture
+
+
+def vertex_normals(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Outward normals `(V, 3)` float64, of a length of no meaning: the sums of the faces' around each vertex.
+
+    Args:
+        vertices: `(V, 3)`.
+        faces: `(F, 3)`, vertex indices, outwards counter-clockwise.
+    """
+    corners = vertices[faces]
+    face_normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normals = np.zeros((len(vertices), 3))
+    for corner in range(3):
+        np.add.at(normals, faces[:, corner], face_normals)
+    return normals

@@ -70,6 +70,11 @@ def ar(cfg: DictConfig) -> dict[str, float]:
     """
     task = cfg.task
     recording = _recording(cfg)
+    if task.true_keypoints and not hasattr(recording, "truth"):
+        raise ValueError(
+            "task.true_keypoints: expected a recording whose truth is known (recording=synthetic), got "
+            f"'{recording.name}'; leave it out"
+        )
     smoothing = None
     if task.smooth:
         smoothing = SmoothingSettings(**(OmegaConf.to_container(task.smoothing) or {}))  # type: ignore[arg-type]
@@ -87,7 +92,7 @@ def ar(cfg: DictConfig) -> dict[str, float]:
         "segmentation": OmegaConf.to_container(cfg.segmentation, resolve=True) if cfg.segmentation else None,
         "smoothing": None if smoothing is None else asdict(smoothing),
         "mends_flips": task.mend_flips,
-        "keypoints": task.keypoints,
+        "true_keypoints": task.true_keypoints,
         "strict": task.strict,
     }
     store = Store(directory, settings)
@@ -171,7 +176,7 @@ def _run(system: ArSystem, recording: Any, store: Store, task: DictConfig) -> No
         for frame in recording.frames(done):
             reading = time.perf_counter() - begin
             truth = recording.truth(frame.number) if has_truth else None
-            keypoints = truth.keypoints if truth is not None and task.keypoints == "true" else None
+            keypoints = truth.keypoints if truth is not None and task.true_keypoints else None
             result = system(frame, keypoints)
             begin = time.perf_counter()
             picture = draw_overlay(result, recording.camera)

@@ -110,3 +110,10 @@ def test_a_recording_without_a_person_is_an_error_that_says_why(recording, compo
     recording.depth = recording.depth * 0
     with pytest.raises(ValueError, match=r"none of 5 frames could be predicted: depth: all pixels are 0"):
         ar(config(compose_config, tmp_path))
+
+
+def test_true_keypoints_are_those_of_a_recording_whose_truth_is_known(recording, compose_config, tmp_path):
+    with pytest.raises(
+        ValueError, match=r"task.true_keypoints: expected a recording whose truth is known.*'held'"
+    ):
+        ar(config(compose_config, tmp_path, "task.true_keypoints=true"))
