@@ -28,6 +28,7 @@ _PROVENANCE_KEY = "ljn"
 _CONTENT_ERRORS: tuple[type[Exception], ...] = (ImportError, *READ_ERRORS)
 _MAX_TEXT = 1000
 _MAX_SHARING = 16
+_MIN_FITTING = 0.9  # of the numbers of a network that begins with another's weights
 _DTYPES = (
     torch.float16, torch.bfloat16, torch.float32, torch.float64, torch.bool, torch.uint8, torch.int8, torch.int16,
     torch.int32, torch.int64,
@@ -321,6 +322,30 @@ def load_state(module: torch.nn.Module, checkpoint: Checkpoint, argument: str = 
     except ValueError as error:
         raise ValueError(f"{argument}: '{checkpoint.path}' {error}") from None
     module.load_state_dict(checkpoint.state)
+
+
+def begin_with(module: torch.nn.Module, checkpoint: Checkpoint, argument: str) -> list[str]:
+    """Load the weights of a checkpoint that a training begins with; errors name `argument`.
+
+    Its network may differ in a few shapes: another number of channels that it sees, of joints that it gives.
+
+    Returns:
+        The names of the weights that are of another shape, and left as they are.
+
+    Raises:
+        ValueError: The weights have other names, or those that fit are less than nine in ten.
+    """
+    state = module.state_dict()
+    fitting = {
+        name: value
+        for name, value in checkpoint.state.items()
+        if name in state and value.shape == state[name].shape
+    }
+    size, fitting_size = (sum(value.numel() for value in values.values()) for values in (state, fitting))
+    if set(checkpoint.state) != set(state) or fitting_size < _MIN_FITTING * size:
+        load_state(module, checkpoint, argument)  # says what differs
+    module.load_state_dict(state | fitting)
+    return sorted(set(state) - set(fitting))
 
 
 def load_module(

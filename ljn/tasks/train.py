@@ -5,16 +5,18 @@ from pathlib import Path
 
 import torch
 from hydra import compose
+from hydra.utils import get_class
 from omegaconf import DictConfig, open_dict
 
 from ljn.building import build
 from ljn.data import DataModule
 from ljn.refinement import chosen_settings
 from ljn.runs import layout
-from ljn.runs.checkpoints import Checkpoint, load_state, read_checkpoint
+from ljn.runs.checkpoints import Checkpoint, begin_with, read_checkpoint
 from ljn.runs.files import read_metrics, write_json
 from ljn.runs.identity import config_hash, identity
 from ljn.runs.keys import Key, key_of, kind_of
+from ljn.runs.packages import find_package, is_package, shipped
 from ljn.runs.record import RunRecord, alone_in, is_complete
 from ljn.tasks.overrides import typed_overrides
 from ljn.tasks.processes import check_trains_in_processes, is_first_process, num_processes
@@ -72,7 +74,13 @@ def _earlier_stages(cfg: DictConfig) -> Checkpoint | None:
             cfg.data.detector_ckpt = str(path)
     if begins_with is None:
         return None
-    return read_checkpoint(trained(composed(begins_with, is_same_stage=True), begins_with))
+    argument = "task.begins_with"
+    if begins_with in shipped() or is_package(begins_with):
+        stage = get_class(cfg.module._target_).stage
+        return read_checkpoint(find_package(begins_with, argument), argument, stage)
+    if Path(begins_with).suffix == Path(layout.BEST_CHECKPOINT).suffix:
+        return read_checkpoint(begins_with, argument)
+    return read_checkpoint(trained(composed(begins_with, is_same_stage=True), begins_with), argument)
 
 
 def trained(cfg: DictConfig, name: str) -> Path:
@@ -104,7 +112,9 @@ def _train(
     prepare_process(cfg)
     module = build(cfg.module)
     if initial is not None:
-        load_state(module, initial, "task.begins_with")
+        anew = begin_with(module, initial, "task.begins_with")
+        if anew:
+            _LOG.info("begins with '%s', but for %s, of another shape", initial.path, ", ".join(anew))
     datamodule.takes = module.takes
     check_trains_in_processes(module, num_processes(cfg.trainer))
     last, best = run_dir / layout.LAST_CHECKPOINT, run_dir / layout.BEST_CHECKPOINT
