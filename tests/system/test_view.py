@@ -72,7 +72,8 @@ def screenshots(browser, url, profile, seconds):
     try:
         port = profile / "DevToolsActivePort"
         while not (port.is_file() and len(port.read_text().split()) == 2):
-            assert process.poll() is None and time.monotonic() < end, "the browser did not start"
+            assert process.poll() is None, "the browser has stopped"
+            assert time.monotonic() < end, "the browser did not start"
             time.sleep(0.2)
         targets = f"http://127.0.0.1:{port.read_text().split()[0]}/json"
         with urllib.request.urlopen(targets, timeout=60) as answer:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
 from ljn import Pipeline
@@ -260,6 +261,35 @@ def test_a_keypoint_detector_is_a_package_of_its_own_and_finds_keypoints_in_pred
         ValueError, match=r"a package holds a keypoint detector or the two other stages, got both"
     ):
         package(smoke_config(tmp_path, "task=package", *given, *checkpoints, "task.licence=CC0-1.0"))
+
+
+def test_a_training_begins_with_a_package_s_weights_but_for_those_of_another_shape(
+    write_checkpoint, smoke_config, tmp_path
+):
+    ckpt = write_checkpoint("keypoints/cpn_depth")
+    given = [f"task.keypoint_detector={ckpt}", f"task.directory={tmp_path}", "task.name=cpn"]
+    package(smoke_config(tmp_path, "task=package", *given, "task.licence=CC0-1.0", "task.precision=half"))
+    # So slow that nothing is learned.
+    slow = ["experiment=keypoints/cpn", "module.optimizer.lr=1e-12", "callbacks.pictures=null"]
+    beginning = tmp_path / "cpn.safetensors"
+    cfg = smoke_config(tmp_path, *slow, f"task.begins_with={beginning}", "seed=1")
+    train(cfg)
+    record = json.loads((Path(cfg.paths.run_dir) / "record.json").read_text())
+    assert record["begins_with"]["path"] == str(beginning)
+    first, second = (
+        torch.load(path, weights_only=True)["state_dict"]
+        for path in (ckpt, f"{cfg.paths.run_dir}/checkpoints/best.ckpt")
+    )
+    weights = "net.last.1.weight"
+    torch.testing.assert_close(second[weights], first[weights].half().float())
+    assert second["net.backbone.conv1.weight"].shape[1] == 3
+    for name, message in (
+        ("small", r"begins_with: .* holds detector and mesh alone, but no keypoints"),
+        ("cpn_depth", r"begins_with: .* holds the weights of another model"),  # larger than preset=smoke
+        (f"{tmp_path / 'none.ckpt'}", r"begins_with: no file"),
+    ):
+        with pytest.raises((ValueError, FileNotFoundError), match=message):
+            train(smoke_config(tmp_path, *slow, f"task.begins_with={name}"))
 
 
 @pytest.mark.slow
