@@ -15,7 +15,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from ljn.runs.processes import Interruption, end_on_signals, is_first_process
-from ljn.tasks.arguments import prepare_arguments
+from ljn.tasks.arguments import check_is_read, prepare_arguments
 from ljn.tasks.processes import is_job_of_sweep, sweep_name
 from ljn.tasks.schema import register
 
@@ -31,6 +31,7 @@ def main(cfg: DictConfig) -> float | None:
     if cfg.group is None and is_job_of_sweep():
         cfg.group = sweep_name(HydraConfig.get())
     try:
+        check_is_read(cfg)
         metrics = hydra.utils.get_method(cfg.task._target_)(cfg)
     except (ValueError, FileNotFoundError, ImportError, FloatingPointError) as error:
         # A user's mistake: the message names the fix. A sweep needs the exception, a developer the traceback.

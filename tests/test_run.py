@@ -49,6 +49,15 @@ def test_a_misspelt_key_is_named_before_anything_starts():
     assert "Traceback" not in done.stderr
 
 
+def test_a_key_that_the_task_would_not_see_is_named():
+    done = python("run.py", "task=figures", "refine=true")
+    assert done.returncode == 1
+    assert (
+        "refine: task=figures does not read it; leave it out, or choose one of the tasks predict"
+        in done.stderr
+    )
+
+
 def test_a_user_error_is_one_message_without_a_traceback(tmp_path):
     done = python("run.py", "model.radii_m=[0.2]", f"paths.output_dir={tmp_path}")
     assert done.returncode == 1

@@ -1,4 +1,6 @@
-"""The command line before Hydra reads it: paths that its grammar would take apart, short names of keys."""
+"""The command line: before Hydra reads it, paths that its grammar would take apart and short names of keys; afterwards,
+keys that the task would not see.
+"""
 
 import os
 import re
@@ -6,7 +8,11 @@ from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
 
+from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.types import Quote, QuotedString
+from omegaconf import DictConfig
+
+from ljn.runs.keys import key_of
 
 _SHORT = {
     **dict.fromkeys(("input", "camera"), ("task=predict", "task=ar")),
@@ -15,6 +21,16 @@ _SHORT = {
     "mesh_ckpt_path": ("task=predict", "task=ar", "task=demo", "task=package", "task=benchmark"),
 }
 """Keys of tasks that may be typed without their `task.`, and the tasks that they are of."""
+_OF_TASKS = {
+    "ckpt_path": "predict ar evaluate benchmark demo package train",
+    "weights": "predict ar evaluate benchmark demo figures train",
+    "refine": "predict ar evaluate benchmark demo cross train",
+    "bench": "benchmark",
+    "predictor": "benchmark",
+    "recording": "ar",
+    "segmentation": "ar",
+}
+"""Keys of the root, and the tasks that read them; a training, to refuse them."""
 _PATHS = (
     *(f"task.{name}" for name in (*_SHORT, "directory")),
     *("ckpt_path", "weights", "paths.output_dir", "paths.cache_dir", "body.path"),
@@ -50,6 +66,18 @@ def prepare_arguments(arguments: Sequence[str]) -> list[str]:
                 f"{argument}: it needs a package that is not installed: pip install -e '.[{plugin[1]}]'"
             )
     return [_prepare(argument, arguments) for argument in arguments]
+
+
+def check_is_read(cfg: DictConfig) -> None:
+    """Raise a `ValueError` for a key that was typed for a task which would not see it."""
+    task = cfg.task._target_.rpartition(".")[2]
+    for line in HydraConfig.get().overrides.task:
+        key = key_of(line).partition(".")[0]
+        readers = _OF_TASKS.get(key, task).split()
+        if task not in readers and cfg[key] is not None:
+            raise ValueError(
+                f"{key}: task={task} does not read it; leave it out, or choose one of the tasks {', '.join(readers)}"
+            )
 
 
 def _is_there(plugin: str) -> bool:
