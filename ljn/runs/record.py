@@ -16,7 +16,7 @@ from typing import Any, Self
 
 from ljn.runs import layout
 from ljn.runs.files import read_json, read_metrics, write_json
-from ljn.runs.processes import is_first_process
+from ljn.runs.processes import Interruption, is_first_process
 
 RECORD_VERSION = 1
 _LOG = logging.getLogger(__name__)
@@ -70,13 +70,17 @@ class RunRecord:
         if error is None:
             self.add(status="complete")
             return
-        # What ends a process, such as `Interruption`, is no error of the run.
-        is_failure = isinstance(error, Exception)
+        # What ends a process, such as `Interruption`, is no error of the run; nor is what it leads to: a signal to a
+        # group of processes ends data workers, too, and the loader makes an error of that.
+        interruption = _interruption_behind(error)
+        is_failure = isinstance(error, Exception) and interruption is None
         ending = {"status": "failed", "error": f"{type(error).__name__}: {error}"}
         try:
             self.add(**ending if is_failure else {"status": "interrupted"})
         except OSError as unwritten:  # the error that ended the run is the one to see
             _LOG.warning("%s: the record's last state cannot be written: %s", self.directory, unwritten)
+        if interruption is not None and interruption is not error:
+            raise interruption from None
 
     def _write(self) -> None:
         if not self._writes:
@@ -84,6 +88,12 @@ class RunRecord:
         elapsed = time.monotonic() - self._started
         self._facts["wall_time_s"] = round(self._wall_time_before + elapsed, 1)
         write_json(self.directory / layout.RECORD, self._facts)
+
+
+def _interruption_behind(error: BaseException | None) -> Interruption | None:
+    while error is not None and not isinstance(error, Interruption):
+        error = error.__context__
+    return error
 
 
 @contextmanager

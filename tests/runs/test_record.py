@@ -41,6 +41,16 @@ def test_a_record_says_how_a_run_ended(tmp_path, error, status):
     assert record.get("error") == ("RuntimeError: broken" if status == "failed" else None)
 
 
+def test_a_data_worker_that_the_same_signal_ended_is_no_error_of_the_run(tmp_path):
+    with pytest.raises(Interruption) as ended, RunRecord(tmp_path, {}):
+        try:
+            raise Interruption(signal.SIGTERM)
+        finally:
+            raise RuntimeError("DataLoader worker (pid 3) is killed by signal: Terminated.")
+    assert ended.value.code == 143
+    assert json.loads((tmp_path / "record.json").read_text())["status"] == "interrupted"
+
+
 def test_a_second_attempt_is_counted_and_its_time_added(tmp_path):
     write_json(tmp_path / "record.json", {"wall_time_s": 100.0, "attempts": 1, "status": "running"})
     with RunRecord(tmp_path, {}):
