@@ -42,11 +42,14 @@ def test_a_record_says_how_a_run_ended(tmp_path, error, status):
 
 
 def test_a_data_worker_that_the_same_signal_ended_is_no_error_of_the_run(tmp_path):
-    with pytest.raises(Interruption) as ended, RunRecord(tmp_path, {}):
+    def fit():
         try:
             raise Interruption(signal.SIGTERM)
         finally:
             raise RuntimeError("DataLoader worker (pid 3) is killed by signal: Terminated.")
+
+    with pytest.raises(Interruption) as ended, RunRecord(tmp_path, {}):
+        fit()
     assert ended.value.code == 143
     assert json.loads((tmp_path / "record.json").read_text())["status"] == "interrupted"
 
