@@ -97,6 +97,12 @@ _POINTS = Axis("sampled points", "data.observation.num_points")
 
 _DETECTOR = (_MPJPE_EQ38, _PCKH)
 _MESH = (_APVE, _MPJPE_EQ38)
+_KEYPOINTS = (
+    Column("crop_error_px", "error", "px", "min"),
+    _PCKH,
+    Column("oks_ap", "OKS-AP", "%", "max"),
+    Column("exchanged", "exchanged", "%", "min"),
+)
 _DETECTOR_NOISE = (_MAX_PX, _MEAN_PX, *_DETECTOR)
 _MESH_NOISE = (_MAX_MM, _MEAN_MM, *_MESH)
 
@@ -232,6 +238,20 @@ _ALL = (
         ),
         axis=_POINTS,
         notes=(_EQ38_NOTE,),
+    ),
+    Table(
+        "backgrounds",
+        "Section 4.3.1: 2D joints from colours, by what is behind the person (in the thesis, in words alone)",
+        _KEYPOINTS,
+        (
+            Row("trained on black, tested on black", "keypoints/cpn"),
+            Row("trained on random, tested on black", "keypoints/cpn_random_on_black"),
+            Row("trained on black, tested on random", "keypoints/cpn_on_random"),
+            Row("trained on random, tested on random", "keypoints/cpn_random"),
+        ),
+        notes=(
+            "Errors are pixels of the crop; exchanged: samples that fit better with left and right exchanged.",
+        ),
     ),
     Table(
         "demo",
