@@ -18,18 +18,18 @@ def module(**changes):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("experiment", ["cpn_depth"])
+@pytest.mark.parametrize("experiment", ["cpn", "cpn_depth"])
 def test_sixteen_samples_are_overfitted_to_under_a_pixel(experiment, compose_config, tmp_path):
     cfg = compose_config(
         *(f"experiment=keypoints/{experiment}", "preset=small", f"paths.output_dir={tmp_path}"),
         # Nobody has shown it mirror images.
-        *("model.flip_test=false", "data.num_train=16", "data.num_workers=0"),
+        *("model.flip_test=false", "data.num_test=16", "data.num_workers=0"),
     )
     torch.manual_seed(0)
     detector = build(cfg.module)
     data = build(cfg.data)
     data.takes = detector.takes
-    batch, _ = data.examples("train", range(16))
+    batch, _ = data.examples("test", range(16))  # whole persons
     steps = 300
     optimizer = torch.optim.RAdam(detector.net.parameters())
     schedule = OneCycleLR(optimizer, 3e-3, steps)
