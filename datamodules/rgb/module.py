@@ -1,5 +1,6 @@
 """Colour crops of bodies, rendered on the fly: the training data of 2D joint detectors."""
 
+import logging
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from ljn.cloud.rgb import RgbRecipe
 from ljn.data import SPLITS, Batch
 from ljn.geometry.camera import Camera
 
+_LOG = logging.getLogger(__name__)
 RGB_SAMPLES_VERSION = "rgb 1"
 _HELD = ("rgb", "rgb_camera")
 
@@ -114,6 +116,12 @@ class RgbDataModule(RenderedDataModule):
         """See `RenderedDataModule`."""
         super().prepare_data()
         self.background.check()
+        if isinstance(self.source, FrameSource):
+            _LOG.info(
+                "%s: bodies stand where the frames show them; data.camera, and heading, distance_m, margin_px and "
+                "focal_factors of data.synthesis, are of no effect",
+                self.source.name,
+            )
 
     def setup(self, stage: str) -> None:
         """See `RenderedDataModule`."""

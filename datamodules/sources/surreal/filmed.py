@@ -51,6 +51,7 @@ class FilmedSource(SurrealSource, Generic[Image]):
     def __init__(self, *args: Any, body_path: str | Path | None = None, **others: Any) -> None:
         super().__init__(*args, **others)
         self.body_path = body_path
+        self.files = (*self.files, self.images, SEGMENTATION)
 
     @property
     @abstractmethod
@@ -95,7 +96,7 @@ class FilmedSource(SurrealSource, Generic[Image]):
 
     def _is_usable(self, entry: ClipEntry) -> bool:
         return super()._is_usable(entry) and all(
-            (self.tree / f"{entry.name}{kind}").is_file() for kind in (self.images, SEGMENTATION)
+            (self.tree / f"{entry.name}{end}").is_file() for end in self.files
         )
 
     @cached_property

@@ -237,6 +237,14 @@ def test_clips_without_a_whole_video_or_a_body_are_left_out_and_named(tmp_path, 
     assert set(records.sequence) == {"test/run0/01_01/01_01_c0001"}
     assert "01_01_c0002.mp4: cannot be used as a clip's video (expected the 6 frames" in caplog.text
     assert "c0004" not in caplog.text
+    with pytest.raises(
+        ValueError, match=r"no usable clip for 'train' .* \(\*_info\.mat, \*\.mp4, \*_segm\.mat\)"
+    ):
+        SurrealRgbSource(tmp_path).records("train", 9, 0)
+    with pytest.raises(
+        ValueError, match=r"none has .* all of its files \(\*_info\.mat, \*_depth\.mat, \*_segm"
+    ):
+        SurrealDepthSource(tmp_path).check()
     first.write_bytes(b"")
     with pytest.raises(ValueError, match=r"no \*\.mp4 in .* can be read, of 3 clips"):
         SurrealRgbSource(tmp_path).check()
@@ -245,10 +253,14 @@ def test_clips_without_a_whole_video_or_a_body_are_left_out_and_named(tmp_path, 
 # The data module
 
 
-def test_a_module_of_frames_trains_and_keeps_fixed_sets(make_module, tree):
+def test_a_module_of_frames_trains_and_keeps_fixed_sets(make_module, caplog):
+    caplog.set_level(logging.INFO)
     data = make_module()
     assert isinstance(data.source, FrameSource)
     data.prepare_data()
+    assert (
+        "heading, distance_m, margin_px and focal_factors of data.synthesis, are of no effect" in caplog.text
+    )
     data.setup("fit")
     batches = list(data.train_dataloader())
     assert [batch["rgb"].shape for batch in batches] == [(2, 3, 32, 32)] * 2
