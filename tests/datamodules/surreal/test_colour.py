@@ -3,6 +3,7 @@ import pickle
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -12,7 +13,7 @@ from datamodules.sources import FrameSource
 from datamodules.sources.surreal import SurrealDepthSource, SurrealRgbSource, SurrealSource
 from datamodules.sources.surreal.video import read_video
 from ljn.body import SMPL
-from ljn.body.skeleton import JOINT_INDEX
+from ljn.body.skeleton import JOINT_INDEX, MIRROR
 from ljn.cloud.rgb import RgbRecipe, crop_rgb
 from ljn.geometry.camera import project
 from ljn.geometry.rotations import body_to_camera
@@ -131,6 +132,41 @@ def test_a_fixed_crop_is_that_of_prediction(make, tree):
         # There windows are of whole pixels, which are some three of the crop's.
         np.testing.assert_allclose(camera, intrinsics, rtol=0.03, atol=3)
         assert np.abs(crop.numpy().astype(int) - expected).mean() < 8
+
+
+class Ramp:
+    """Frames of a source whose red is the column and whose green the row; not rounded to whole numbers."""
+
+    def __init__(self, source):
+        self.source = source
+
+    def filmed(self, records, rows):
+        scene, frames = self.source.filmed(records, rows)
+        v, u = np.mgrid[:240, :320]
+        ramp = np.stack([u, v, 0 * u], -1).astype(np.float32)
+        return scene, [frame._replace(rgb=ramp) for frame in frames]
+
+
+@pytest.mark.parametrize("settings", [UPRIGHT, RgbSettings(mirrored=0), RgbSettings(mirrored=1)],
+                         ids=["fixed", "training", "mirrored"])  # fmt: skip
+def test_a_crop_shows_at_a_joint_what_the_frame_does(make, settings):
+    synthesizer = make(settings, "own")
+    scene, _ = synthesizer.source.filmed(synthesizer.records, range(8))
+    synthesizer.source = Ramp(synthesizer.source)
+    batch = synthesizer.batch(KEYS)
+    order = list(MIRROR) if settings.mirrored else slice(None)
+    expected = project(scene.joints[:, order], synthesizer.camera.intrinsics(torch.float64))
+    errors = []
+    for image, pixels, places in zip(
+        batch["rgb"].numpy(), project(batch["joints"], batch["rgb_camera"]), expected
+    ):
+        red, green = image[:2]
+        for (u, v), place in zip(pixels.tolist(), places.numpy()):
+            if 1 < u < 94 and 1 < v < 126:
+                seen = [cv2.getRectSubPix(channel, (1, 1), (u, v)).item() for channel in (red, green)]
+                errors.append(seen - place)
+    assert len(errors) > 100
+    assert np.abs(errors).max() < 0.05
 
 
 def test_backgrounds(make):
