@@ -116,12 +116,6 @@ class RgbDataModule(RenderedDataModule):
         """See `RenderedDataModule`."""
         super().prepare_data()
         self.background.check()
-        if isinstance(self.source, FrameSource):
-            _LOG.info(
-                "%s: bodies stand where the frames show them; data.camera, and heading, distance_m, margin_px and "
-                "focal_factors of data.synthesis, are of no effect",
-                self.source.name,
-            )
 
     def setup(self, stage: str) -> None:
         """See `RenderedDataModule`."""
@@ -156,7 +150,7 @@ class RgbDataModule(RenderedDataModule):
 
 
 def _check_pictures(source: PoseSource, background: Background, photo: Photography | None) -> None:
-    """Raise a `ValueError` where pictures are asked for that a source cannot have."""
+    """Raise a `ValueError` where pictures are asked for that a source cannot have; say what has no effect on them."""
     has_frames = isinstance(source, FrameSource)
     if isinstance(source, ImageSource):
         raise ValueError(
@@ -167,6 +161,12 @@ def _check_pictures(source: PoseSource, background: Background, photo: Photograp
         raise ValueError(
             f"photo: expected null with '{source.name}', whose pictures are taken: looks, lights and a camera's faults "
             "are for rendered ones; set data/photo=plain"
+        )
+    if has_frames:
+        _LOG.info(
+            "%s: bodies stand where the frames show them; data.camera, and heading, distance_m, margin_px and "
+            "focal_factors of data.synthesis, are of no effect",
+            source.name,
         )
     if background.kind == "own" and not has_frames:
         raise ValueError(
