@@ -38,6 +38,18 @@ class Scene(NamedTuple):
     depth: list[np.ndarray]
 
 
+class Frame(NamedTuple):
+    """A colour image of one person.
+
+    Attributes:
+        rgb: `(H, W, 3)` uint8.
+        mask: `(H, W)` bool, where the person is seen.
+    """
+
+    rgb: np.ndarray
+    mask: np.ndarray
+
+
 def mirrored(scene: Scene, which: Sequence[bool]) -> Scene:
     """A scene, those of its bodies that `which` says as a mirror shows them: image, camera, joints and pose.
 

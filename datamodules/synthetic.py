@@ -17,7 +17,7 @@ from datamodules.placement import check_margin
 from datamodules.posing import smallest_camera
 from datamodules.rendered import RenderedDataModule
 from datamodules.sensor import Sensor
-from datamodules.sources import ImageSource, PoseSource
+from datamodules.sources import FrameSource, ImageSource, PoseSource
 from datamodules.synthesis import SAMPLES_VERSION, DepthSynthesizer, RecordedSynthesizer, SynthesisSettings
 from ljn.cloud.lifting import depth_at
 from ljn.cloud.normals import get_normal_estimator
@@ -106,6 +106,11 @@ class SyntheticDepthDataModule(RenderedDataModule):
             ),
             *(redraw_each_epoch, reuse, num_workers, prefetch_batches),
         )
+        if isinstance(source, FrameSource):
+            raise ValueError(
+                f"source: expected poses, or depth images, got '{source.name}', which has frames in colour; use "
+                "data=rgb, or of SURREAL data/source=surreal_depth or surreal"
+            )
         check_margin(smallest_camera(camera, synthesis), synthesis.margin_px)
         self.camera = camera
         # A detector moves the lifted joints, and found keypoints are lifted.

@@ -2,6 +2,7 @@
 
 from datamodules.rgb.backgrounds import Background
 from datamodules.rgb.chain import ColourStep, Photo, Photography
+from datamodules.rgb.frames import FrameSynthesizer
 from datamodules.rgb.module import RgbDataModule
 from datamodules.rgb.photography import Defocus, Jpeg, LowResolution, MaskErrors, Motion, Noise, Tone
 from datamodules.rgb.styling import Garments, Hair, Lights, Patterns, Skin
@@ -11,6 +12,7 @@ __all__ = [
     "Background",
     "ColourStep",
     "Defocus",
+    "FrameSynthesizer",
     "Garments",
     "Hair",
     "Jpeg",

@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-BACKGROUNDS = ("black", "random", "green")
+BACKGROUNDS = ("black", "random", "green", "own")
 _SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".webp")
 _COARSER = 4
 _GREEN = np.array([0.16, 0.55, 0.22])
@@ -19,7 +19,8 @@ class Background:
 
     Attributes:
         kind: `black` (the person's mask is applied; what it wrongly takes is of a green curtain or of a random image),
-            `random` (images made at random, or those of `path`) or `green` (a plain green curtain, unevenly lit).
+            `random` (images made at random, or those of `path`), `green` (a plain green curtain, unevenly lit) or `own`
+            (what is there in the frame, of a source of frames).
         path: A folder of images, also in folders below it, for `random`; None for images made at random.
     """
 

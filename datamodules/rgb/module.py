@@ -1,5 +1,6 @@
 """Colour crops of bodies, rendered on the fly: the training data of 2D joint detectors."""
 
+import logging
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -9,14 +10,16 @@ from torch import Tensor
 from datamodules.placement import check_margin
 from datamodules.posing import smallest_camera
 from datamodules.rendered import RenderedDataModule
-from datamodules.rgb.backgrounds import Background
+from datamodules.rgb.backgrounds import BACKGROUNDS, Background
 from datamodules.rgb.chain import Photography
+from datamodules.rgb.frames import FrameSynthesizer
 from datamodules.rgb.synthesis import RgbSettings, RgbSynthesizer
-from datamodules.sources import PoseSource
+from datamodules.sources import FrameSource, ImageSource, PoseSource
 from ljn.cloud.rgb import RgbRecipe
 from ljn.data import SPLITS, Batch
 from ljn.geometry.camera import Camera
 
+_LOG = logging.getLogger(__name__)
 RGB_SAMPLES_VERSION = "rgb 1"
 _HELD = ("rgb", "rgb_camera")
 
@@ -25,11 +28,12 @@ class RgbDataModule(RenderedDataModule):
     """Bodies from a pose source, seen by a colour camera; see `RenderedDataModule`.
 
     A crop's joints are those of its own camera frame: `project(joints, rgb_camera)` are the keypoints in its pixels.
-    Crops of the fixed sets show the window of the body, upright; training crops vary. Frames of other makers, such as
-    SURREAL's, are a data module of their own, with the same keys in its batches.
+    Crops of the fixed sets show the window of the body, upright; training crops vary. Of a source of frames, such as
+    SURREAL's, crops are cut from these: its bodies stand where they are, so that the camera and how bodies come before
+    it are the source's, and the pictures are taken, so that there is no `photo`.
 
     Args:
-        source: Where poses come from.
+        source: Where poses come from, and of a `FrameSource` pictures, too.
         camera: The colour camera.
         synthesis: How bodies come before it, and how training crops vary.
         recipe: Size of the crops.
@@ -89,6 +93,7 @@ class RgbDataModule(RenderedDataModule):
             ),
             *(redraw_each_epoch, None, num_workers, prefetch_batches),
         )
+        _check_pictures(source, background, photo)
         check_margin(smallest_camera(camera, synthesis), synthesis.margin_px)
         self.camera = camera
         self.synthesis = synthesis
@@ -123,7 +128,7 @@ class RgbDataModule(RenderedDataModule):
 
     def _synthesizer(self, split: str) -> RgbSynthesizer:
         is_train = split == "train"
-        return RgbSynthesizer(
+        arguments = (
             self._records_of(split),
             self.bodies,
             self.camera,
@@ -134,8 +139,37 @@ class RgbDataModule(RenderedDataModule):
             torch.float32 if is_train else torch.float64,
             self.photo,
         )
+        if isinstance(self.source, FrameSource):
+            return FrameSynthesizer(self.source, *arguments)
+        return RgbSynthesizer(*arguments)
 
     @property
     def _settings(self) -> str:
         """See `RenderedDataModule`."""
         return f"{self.camera} {self.synthesis.without_variation()} {self.rgb_recipe} {self.background} {self.photo}"
+
+
+def _check_pictures(source: PoseSource, background: Background, photo: Photography | None) -> None:
+    """Raise a `ValueError` where pictures are asked for that a source cannot have; say what has no effect on them."""
+    has_frames = isinstance(source, FrameSource)
+    if isinstance(source, ImageSource):
+        raise ValueError(
+            f"source: expected poses, or frames in colour, got '{source.name}', which has depth images; use "
+            "data=synthetic, or of SURREAL data/source=surreal_rgb or surreal"
+        )
+    if has_frames and photo is not None:
+        raise ValueError(
+            f"photo: expected null with '{source.name}', whose pictures are taken: looks, lights and a camera's faults "
+            "are for rendered ones; set data/photo=plain"
+        )
+    if has_frames:
+        _LOG.info(
+            "%s: bodies stand where the frames show them; data.camera, and heading, distance_m, margin_px and "
+            "focal_factors of data.synthesis, are of no effect",
+            source.name,
+        )
+    if background.kind == "own" and not has_frames:
+        raise ValueError(
+            f"background.kind: 'own' is what the frames of a source show, and '{source.name}' has none; choose one of "
+            f"{', '.join(kind for kind in BACKGROUNDS if kind != 'own')}, or data/source=surreal_rgb"
+        )

@@ -29,8 +29,8 @@ from ljn.geometry.camera import Camera
 from ljn.geometry.rotations import rotation_about
 from ljn.render import Renderer, get_renderer
 
-_LOOK, _PHOTO, _CROP, _BACKGROUND = 9, 10, 11, 12  # see datamodules.posing
-_FINER = 2  # times as many pixels along a side are rendered as the crop has
+_LOOK, _PHOTO, _CROP, BACKGROUND = 9, 10, 11, 12  # see datamodules.posing
+FINER = 2  # times as many pixels along a side are rendered as the crop has
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,24 @@ class RgbSettings:
         return replace(self, scale=(1.0, 1.0), shift=0.0, rotation_deg=0.0, mirrored=0.0)
 
 
-class _Variation(NamedTuple):
+class Picture(NamedTuple):
+    """A crop and its camera.
+
+    Attributes:
+        crop: `(3, h, w)` uint8.
+        intrinsics: `(4,)`: fx, fy, cx, cy in the crop's pixels.
+    """
+
+    crop: np.ndarray
+    intrinsics: np.ndarray
+
+    def mirrored(self) -> "Picture":
+        """The picture as a mirror shows it."""
+        fx, fy, cx, cy = self.intrinsics
+        return Picture(self.crop[..., ::-1], np.array([fx, fy, self.crop.shape[-1] - 1 - cx, cy]))
+
+
+class Variation(NamedTuple):
     """How a crop differs from the upright window of the body."""
 
     roll: float
@@ -137,22 +154,17 @@ class RgbSynthesizer(BodySynthesizer):
 
     def batch(self, keys: Sequence[SampleKey]) -> Batch:
         """See `BodySynthesizer`."""
-        posed = self._posed(keys, is_dressed=True)
         variations = [self._variation(key) for key in keys]
+        which = [variation.is_mirrored for variation in variations]
         with _one_thread():
-            made = [
-                self._picture(key, variation, mesh, int(code), camera)
-                for key, variation, mesh, code, camera in zip(
-                    keys, variations, posed.vertices.numpy(), posed.gender, posed.cameras
-                )
-            ]
-        scene = mirrored(
-            Scene(posed.pose, posed.betas, posed.gender, posed.joints, posed.cameras, []),
-            [variation.is_mirrored for variation in variations],
-        )
+            scene, pictures = self._pictures(keys, variations)
+        scene = mirrored(scene, which)
+        pictures = [picture.mirrored() if turn else picture for picture, turn in zip(pictures, which)]
         return Batch(
-            rgb=torch.from_numpy(np.stack([crop for crop, _ in made])),
-            rgb_camera=torch.from_numpy(np.stack([intrinsics for _, intrinsics in made]).astype(np.float32)),
+            rgb=torch.from_numpy(np.stack([picture.crop for picture in pictures])),
+            rgb_camera=torch.from_numpy(
+                np.stack([picture.intrinsics for picture in pictures]).astype(np.float32)
+            ),
             joints=scene.joints.float(),
             pose=scene.pose.float(),
             betas=scene.betas.float(),
@@ -161,12 +173,25 @@ class RgbSynthesizer(BodySynthesizer):
             sample_id=torch.tensor([key[1] for key in keys]),
         )
 
-    def _variation(self, key: SampleKey) -> _Variation:
+    def _pictures(
+        self, keys: Sequence[SampleKey], variations: Sequence[Variation]
+    ) -> tuple[Scene, list[Picture]]:
+        """The bodies before their cameras, and the picture of each; nothing of either is mirrored yet."""
+        posed = self._posed(keys, is_dressed=True)
+        pictures = [
+            self._picture(key, variation, mesh, int(code), camera)
+            for key, variation, mesh, code, camera in zip(
+                keys, variations, posed.vertices.numpy(), posed.gender, posed.cameras
+            )
+        ]
+        return Scene(posed.pose, posed.betas, posed.gender, posed.joints, posed.cameras, []), pictures
+
+    def _variation(self, key: SampleKey) -> Variation:
         settings, rng = self.settings, self._rng(key, _CROP)
         roll = math.radians(settings.rotation_deg) * rng.uniform(-1, 1)
         low, high = settings.scale
         scale = math.exp(rng.uniform(math.log(low), math.log(high)))
-        return _Variation(
+        return Variation(
             roll, scale, settings.shift * rng.uniform(-1, 1, 2), bool(rng.random() < settings.mirrored)
         )
 
@@ -177,29 +202,27 @@ class RgbSynthesizer(BodySynthesizer):
         return rotation_about("x", roll) @ root, betas
 
     def _picture(
-        self, key: SampleKey, variation: _Variation, vertices: np.ndarray, gender: int, camera: Camera
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """The crop `(3, h, w)` uint8 of a mesh `(V, 3)`, metres, camera frame; and its camera `(4,)`."""
+        self, key: SampleKey, variation: Variation, vertices: np.ndarray, gender: int, camera: Camera
+    ) -> Picture:
+        """The picture of a mesh `(V, 3)`, metres, camera frame."""
         height, width = self.recipe.height_px, self.recipe.width_px
         intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
-        window = self._window(vertices, intrinsics, variation)
+        window = self._window(kernels.image_box(vertices, intrinsics), variation)
         look = Look()
         if self.sensor is not None:
             self.sensor.style(look, self._seed(key, _LOOK))
-        fine = window.intrinsics(intrinsics, _FINER * width, _FINER * height)
+        fine = window.intrinsics(intrinsics, FINER * width, FINER * height)
         person, mask = self._render(vertices, gender, fine, look)
-        behind = self.background.image(height, width, self._rng(key, _BACKGROUND))
+        behind = self.background.image(height, width, self._rng(key, BACKGROUND))
         photo = Photo(kernels.composed(person, mask, behind), mask)
         if self.sensor is not None:
             self.sensor.photograph(photo, self._seed(key, _PHOTO))
         crop = kernels.finished(photo.rgb, photo.mask, self.background.kind == "black")
-        own = window.intrinsics(intrinsics, width, height)
-        if variation.is_mirrored:
-            crop, own[2] = crop[..., ::-1], width - 1 - own[2]
-        return np.ascontiguousarray(crop), own
+        return Picture(crop, window.intrinsics(intrinsics, width, height))
 
-    def _window(self, vertices: np.ndarray, intrinsics: np.ndarray, variation: _Variation) -> Window:
-        left, top, width, height = body_window(*kernels.image_box(vertices, intrinsics), self.recipe)
+    def _window(self, box: tuple[float, float, float, float], variation: Variation) -> Window:
+        """The window around a body, by its first and last column, first and last row."""
+        left, top, width, height = body_window(*box, self.recipe)
         across, down = width * variation.scale, height * variation.scale
         left += (width - across) / 2 + variation.shift[0] * across
         top += (height - down) / 2 + variation.shift[1] * down
@@ -209,7 +232,7 @@ class RgbSynthesizer(BodySynthesizer):
         self, vertices: np.ndarray, gender: int, intrinsics: np.ndarray, look: Look
     ) -> tuple[np.ndarray, np.ndarray]:
         """The person `(2 h, 2 w, 3)` float32, linear RGB, black around; and the mask `(2 h, 2 w)` uint8."""
-        size = _FINER * self.recipe.height_px, _FINER * self.recipe.width_px
+        size = FINER * self.recipe.height_px, FINER * self.recipe.width_px
         return drawn(vertices, surface_of(self._body_of[gender]), look, intrinsics, size, self._renderer)
 
 

@@ -10,14 +10,14 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 import torch
 
-from datamodules.scenes import Scene
+from datamodules.scenes import Frame, Scene
 from ljn.body import BodyModel
 from ljn.body.kinematics import without_heading
 from ljn.body.skeleton import NUM_JOINTS
 from ljn.data import SPLITS, Finding
 from ljn.geometry.rotations import BODY_TO_OPENGL, rotmat_to_rotvec, rotvec_to_rotmat
 
-__all__ = ["SPLITS", "Examinable", "ImageSource", "PoseRecords", "PoseSource"]
+__all__ = ["SPLITS", "Examinable", "FrameSource", "ImageSource", "PoseRecords", "PoseSource"]
 
 _HASH_STEP = 1e-5
 
@@ -150,6 +150,15 @@ class ImageSource(Protocol):
 
     def scene(self, records: PoseRecords, rows: Sequence[int], with_depth: bool) -> Scene:
         """The bodies of some records before the camera that saw them; without `with_depth` images are `(0, 0)`."""
+        ...
+
+
+@runtime_checkable
+class FrameSource(Protocol):
+    """A `PoseSource` whose records have colour frames of their own, which are taken in place of rendered pictures."""
+
+    def filmed(self, records: PoseRecords, rows: Sequence[int]) -> tuple[Scene, list[Frame]]:
+        """The bodies of some records before the camera that saw them, without depth, and the frame of each."""
         ...
 
 

@@ -19,7 +19,7 @@ _OF_BODY = {
     "body.predicted": ("module.predicted",),
 }
 _MISSING = object()
-_WHOLE = {"data/sensor=": "data.sensor", "data/source=": "data.source"}
+_WHOLE = {"data/sensor=": "data.sensor", "data/photo=": "data.photo", "data/source=": "data.source"}
 """Groups that an evaluation may choose as a whole, and the key that each sets."""
 
 
@@ -32,15 +32,17 @@ def with_checkpoint_config(cfg: DictConfig, checkpoint: Checkpoint, overrides: l
     """The call's configuration with the checkpoint's model, data and trainer, and the overrides on top.
 
     Of the checkpoint's groups, the keys that `ljn.runs.keys` gives to the machine or the call have this call's values;
-    with `data/sensor=NAME` the data has that chain of steps, its cameras as they are; and with `data/source=NAME` its
-    poses, or images, are those of another source.
+    with `data/sensor=NAME` or `data/photo=NAME` the data has that chain of steps, its cameras as they are; and with
+    `data/source=NAME` its poses, or images, are those of another source. `data=NAME` may name the checkpoint's own kind
+    of data, so that keys that only this kind has can be typed.
 
     Raises:
         FileNotFoundError: The detector of a checkpoint that carries none has gone.
         ValueError: An override is about something that the checkpoint decides.
     """
     plain: dict[str, Any] = OmegaConf.to_container(cfg, resolve=False)  # type: ignore[assignment]
-    new = _newer_keys(plain["data"], checkpoint.config["data"])
+    is_same_kind = plain["data"].get("_target_") == checkpoint.config["data"].get("_target_")
+    new = _newer_keys(plain["data"], checkpoint.config["data"]) if is_same_kind else {}
     plain |= {name: _with_call(checkpoint.config[name], plain[name], name) for name in CONFIG_GROUPS}
     plain["data"] |= new
     merged = OmegaConf.create(plain)
@@ -48,18 +50,16 @@ def with_checkpoint_config(cfg: DictConfig, checkpoint: Checkpoint, overrides: l
     for start, key in _WHOLE.items():
         if any(line.startswith(start) for line in overrides):
             OmegaConf.update(merged, key, OmegaConf.select(cfg, key), merge=False, force_add=True)
-    apply_overrides(merged, [line for line in overrides if not line.startswith(tuple(_WHOLE))])
+    done = (*_WHOLE, "data=") if is_same_kind else tuple(_WHOLE)
+    apply_overrides(merged, [line for line in overrides if not line.startswith(done)])
     _find_detector(merged, checkpoint)
     return merged
 
 
 def _newer_keys(call: Mapping[str, Any], stored: Mapping[str, Any]) -> dict[str, None]:
     """The keys that data of a checkpoint's kind did not have yet when it was trained: null, which changes nothing."""
-    is_same_kind = call.get("_target_") == stored.get("_target_")
     decides = Key.RUN | Key.THROUGH
-    return {
-        key: None for key in call if is_same_kind and key not in stored and kind_of(f"data.{key}") & decides
-    }
+    return {key: None for key in call if key not in stored and kind_of(f"data.{key}") & decides}
 
 
 def _find_detector(cfg: DictConfig, checkpoint: Checkpoint) -> None:

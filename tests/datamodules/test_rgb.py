@@ -301,7 +301,7 @@ def test_backgrounds_are_behind_the_person(make, plain, tmp_path):
 
 
 def test_backgrounds_that_are_not_there_are_named(make_module, tmp_path):
-    with pytest.raises(ValueError, match="kind: expected one of black, random, green, got 'blue'"):
+    with pytest.raises(ValueError, match="kind: expected one of black, random, green, own, got 'blue'"):
         Background("blue")
     data = make_module(background=Background("random", tmp_path / "none"))
     with pytest.raises(FileNotFoundError, match=r"background\.path: no image .* in the folder"):

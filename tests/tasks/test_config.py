@@ -46,6 +46,8 @@ def test_every_config_composes_validates_and_builds(choice, compose_config, tmp_
     partners |= {f"data/photo={name}": "data=rgb" for name in ("plain", "realistic")}
     if choice in partners:
         overrides.append(partners[choice])
+    if choice == "data/source=surreal_rgb":
+        overrides += ["data=rgb", "data/photo=plain"]
     if "model=cpn" in overrides:
         overrides.append("optimized_metric=val/keypoint_error_px")
     cfg = compose_config(*overrides, return_hydra_config=True)

@@ -67,11 +67,15 @@ def test_overrides_change_data_and_nothing_that_the_checkpoint_decides(trained, 
     assert merged.data.synthesis.keypoint_noise_px == 15
     assert merged.data.observation.num_points == 128
     for override in (
-        *("model.edm=false", "preset=thesis", "experiment=detector/basic", "data=synthetic", "seed=3"),
+        *("model.edm=false", "preset=thesis", "experiment=detector/basic", "seed=3"),
         *("data/camera=kinect_v2", "~data.synthesis.distance_m", "+data.more=1", "sweep=demo"),
     ):
         with pytest.raises(ValueError, match="come from the checkpoint"):
             with_checkpoint_config(cfg, checkpoint, [override])
+    with pytest.raises(ValueError, match="data=rgb: model, data and sizes come from the checkpoint"):
+        with_checkpoint_config(
+            evaluation(smoke_config, trained, tmp_path, "data=rgb"), checkpoint, ["data=rgb"]
+        )
     with pytest.raises(ValueError, match=r"'data\.source' holds several values"):
         with_checkpoint_config(cfg, checkpoint, ["data.source=null"])
     with pytest.raises(ValueError, match=r"no key 'data\.num_tset'; known there: .*num_test"):
@@ -106,6 +110,15 @@ def test_a_source_is_chosen_as_a_whole_and_has_the_checkpoints_bodies(trained, s
     merged = with_checkpoint_config(evaluation(smoke_config, trained, tmp_path, *typed), checkpoint, typed)
     assert merged.data.source.weights == {"embedded": 1, "amass": 0, "bvh": 0, "npz": 2, "surreal": 0}
     assert all(source.genders == ["neutral"] for source in merged.data.source.sources.values())
+
+
+def test_colours_are_changed_with_the_name_of_their_kind_of_data(write_checkpoint, smoke_config, tmp_path):
+    checkpoint = read_checkpoint(write_checkpoint("keypoints/cpn"), stage="keypoints")
+    typed = ["data=rgb", "data/photo=plain", "data.background.kind=green"]
+    merged = with_checkpoint_config(smoke_config(tmp_path, *typed), checkpoint, typed)
+    assert merged.data.photo is None
+    assert merged.data.background.kind == "green"
+    assert merged.data.recipe == checkpoint.config["data"]["recipe"]
 
 
 def test_an_evaluation_has_this_machines_values_and_the_checkpoints_keys(

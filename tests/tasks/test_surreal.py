@@ -1,6 +1,7 @@
 """SURREAL by overrides alone: checked, trained on, evaluated on, swept."""
 
 import json
+from pathlib import Path
 
 import pytest
 
@@ -11,6 +12,7 @@ from ljn.runs.packages import find_package
 from ljn.tasks.check import check
 from ljn.tasks.evaluate import evaluate_checkpoint
 from ljn.tasks.overrides import with_checkpoint_config
+from ljn.tasks.train import train
 from tests.datamodules.surreal.writer import write_clip
 
 
@@ -119,3 +121,55 @@ def test_a_table_is_trained_on_surreal(run_py, tmp_path, larger_tree):
     assert "2 jobs" in done.stdout
     [table] = (tmp_path / "sweeps").glob("*/table.md")
     assert "surreal" in table.read_text()
+
+
+@pytest.fixture(scope="module")
+def tree_in_colour(tmp_path_factory):
+    """Two clips with colour frames, of training and of test."""
+    root = tmp_path_factory.mktemp("surreal_in_colour")
+    for split, sequence in (("train", "01_01"), ("test", "03_01")):
+        write_clip(root, split, sequence, video=True, num_frames=6)
+    return root
+
+
+def test_keypoints_are_trained_on_surreals_frames_and_evaluated_on_them(
+    smoke_config, tmp_path, tree_in_colour
+):
+    frames = [*chosen(tree_in_colour, "surreal_rgb"), "data/photo=plain"]
+    small = (
+        "data.num_workers=0",
+        "data.num_train=8",
+        "data.num_val=4",
+        "data.num_test=4",
+        "data.batch_size=4",
+    )
+    cfg = smoke_config(tmp_path, "experiment=keypoints/cpn", *frames, *small, "trainer.max_epochs=1")
+    trained = train(cfg)
+    path = Path(cfg.paths.run_dir) / "checkpoints" / "best.ckpt"
+    assert "SURREAL" in read_checkpoint(path, stage="keypoints").data_licence
+    again = evaluate_checkpoint(smoke_config(tmp_path, "task=evaluate"), path, [], stage="keypoints")
+    assert again == {name: value for name, value in trained.items() if name.startswith("test/")}
+    typed = ["data=rgb", "data.background.kind=own"]
+    call = smoke_config(tmp_path, "task=evaluate", *typed)
+    own = evaluate_checkpoint(call, path, typed, stage="keypoints")
+    assert own["test/keypoint_error_px"] != again["test/keypoint_error_px"]
+
+
+def test_a_checkpoint_of_rendered_people_is_evaluated_on_frames_without_photographs(
+    write_checkpoint, smoke_config, tmp_path, tree_in_colour
+):
+    path = write_checkpoint("keypoints/cpn")
+    typed = ["data=rgb", *chosen(tree_in_colour, "surreal_rgb"), "data.num_test=4", "data.num_workers=0"]
+    call = smoke_config(tmp_path, "task=evaluate", *typed)
+    with pytest.raises(ValueError, match="photo: expected null with 'surreal_rgb'"):
+        evaluate_checkpoint(call, path, typed, stage="keypoints")
+    typed.append("data/photo=plain")
+    call = smoke_config(tmp_path, "task=evaluate", *typed)
+    assert evaluate_checkpoint(call, path, typed, stage="keypoints")["test/keypoint_error_px"] > 0
+    [record] = (tmp_path / "evaluations").glob("*/record.json")
+    assert json.loads(record.read_text())["data"]["source"] == "surreal_rgb"
+
+
+def test_frames_in_colour_are_no_data_of_depth(smoke_config, tmp_path, tree_in_colour):
+    with pytest.raises(ValueError, match=r"'surreal_rgb', which has frames in colour; use data=rgb"):
+        build(smoke_config(tmp_path, *chosen(tree_in_colour, "surreal_rgb")).data)

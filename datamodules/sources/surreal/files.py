@@ -17,6 +17,7 @@ from ljn.reading import shown
 INFO = "_info.mat"
 DEPTH = "_depth.mat"
 SEGMENTATION = "_segm.mat"
+VIDEO = ".mp4"
 IMAGE_SIZE = (240, 320)  # height, width
 BACKGROUND_M = 1e9
 """Depth from here on is background, where the renderer has written 1e10."""

@@ -49,6 +49,8 @@ class SurrealSource:
     name = "surreal"
     version = 1
     cache_dir: Path | None = None
+    files: tuple[str, ...] = (INFO,)
+    """What a clip has to have, by the ends of its files' names."""
     licence = (
         "SURREAL (Varol et al., CVPR 2017), the user's own copy, licensed for non-commercial research: "
         "https://www.di.ens.fr/willow/research/surreal/data"
@@ -121,9 +123,14 @@ class SurrealSource:
         if not any(parts.values()):
             raise ValueError(
                 f"data.source.path: of {len(self.entries)} clips in {self.tree} none has {self.min_frames} frames or "
-                "more and belongs to subjects that are not skipped (data.source.skip)"
+                f"more, all of its files ({self._named_files}), and a subject that is not skipped "
+                "(data.source.skip)"
             )
         return parts
+
+    @property
+    def _named_files(self) -> str:
+        return ", ".join(f"*{end}" for end in self.files)
 
     def _is_usable(self, entry: ClipEntry) -> bool:
         is_skipped = entry.subject in self.skip or entry.sequence in self.skip
@@ -194,7 +201,7 @@ class SurrealSource:
         if not clips:
             raise ValueError(
                 f"data.source.path: no usable clip for '{split}' in {self.tree}/{split}/{self.run}: all are too short, "
-                "damaged, skipped or of subjects of the test set"
+                f"damaged, skipped, of subjects of the test set, or not whole ({self._named_files})"
             )
         number = min(len(clips), max(1, num_records // self.samples_per_clip))
         chosen = np.sort(rng.permutation(len(clips))[:number])

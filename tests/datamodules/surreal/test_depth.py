@@ -19,7 +19,7 @@ from tests.datamodules.surreal.writer import clip_path, make_clip, make_images, 
 
 @pytest.fixture(autouse=True)
 def bodies_read_once(surreal_bodies, monkeypatch):
-    monkeypatch.setattr("datamodules.sources.surreal.depth.load_body_models", lambda *_: surreal_bodies)
+    monkeypatch.setattr("datamodules.sources.surreal.filmed.load_body_models", lambda *_: surreal_bodies)
 
 
 @pytest.fixture(scope="module")
@@ -174,5 +174,5 @@ def test_frames_whose_images_are_damaged_or_empty_are_left_out(tmp_path, caplog)
     assert "01_01_c0002_depth.mat: " in caplog.text
     assert "6 of 9 samples of test come twice" in caplog.text
     depth.with_name("01_01_c0001_depth.mat").write_bytes(b"")
-    with pytest.raises(ValueError, match=r"no depth image in .* can be read, of 3 clips"):
+    with pytest.raises(ValueError, match=r"no \*_depth\.mat in .* can be read, of 3 clips"):
         SurrealDepthSource(tmp_path).check()

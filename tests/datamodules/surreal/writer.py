@@ -4,15 +4,18 @@ The body is turned by matrices of the Blender scene, the camera is the product o
 `getExtrinsicBlender` of SURREAL's repository, written from their definitions.
 """
 
+from fractions import Fraction
 from functools import cache
 from pathlib import Path
 
+import av
 import numpy as np
 import scipy.io
 import torch
 from scipy.spatial.transform import Rotation
 
 from ljn.body import SMPL, load_body_models
+from ljn.body.skeleton import JOINT_INDEX
 from ljn.geometry.camera import Camera
 from ljn.render import get_renderer
 
@@ -94,6 +97,46 @@ def make_images(fields, vertices, radial=True):
     )
 
 
+MARKERS = {"l_wrist": (230, 20, 20), "r_wrist": (20, 20, 230)}
+MARKER_PX = 5
+
+
+def make_pictures(fields, parts):
+    """Mirror images in colour `(T, 240, 320, 3)`: a wall of green that grows with the column, before it a grey person,
+    the lighter the later the frame, with a red left and a blue right wrist.
+    """
+    joints = np.atleast_3d(fields["joints3D"]).transpose(2, 1, 0).astype(float)
+    place = np.asarray(fields["camLoc"], float).ravel()
+    matrix = projection(place)
+    v, u = np.mgrid[:240, :320] + 0.5
+    pictures = np.zeros((len(joints), 240, 320, 3))
+    pictures[..., 1] = 40 + 0.6 * u
+    for k, picture in enumerate(pictures):
+        is_person = parts[f"segm_{k + 1}"] > 0
+        picture[is_person] = person_grey(k)
+        for name, colour in MARKERS.items():
+            x, y, w = matrix @ [*joints[k, JOINT_INDEX[name]], 1]
+            picture[is_person & (np.hypot(u - x / w, v - y / w) < MARKER_PX)] = colour
+    return pictures.astype(np.uint8)
+
+
+def person_grey(frame):
+    """How light the person is in a frame."""
+    return 80 + 20 * (frame % 8)
+
+
+def write_video(path, pictures, rate=30):
+    """As SURREAL's: H.264 with B-frames, 4:2:0; of better quality, that colours may be told apart."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with av.open(str(path), "w", format="mp4") as container:
+        stream = container.add_stream("libx264", rate=Fraction(rate))
+        stream.height, stream.width = pictures[0].shape[:2]
+        stream.pix_fmt, stream.options = "yuv420p", {"crf": "8"}
+        for picture in [*pictures, None]:
+            frame = None if picture is None else av.VideoFrame.from_ndarray(picture, "rgb24")
+            container.mux(stream.encode(frame))
+
+
 def write_mat(path, fields, compressed=False):
     path.parent.mkdir(parents=True, exist_ok=True)
     scipy.io.savemat(path, fields, do_compression=compressed)
@@ -134,14 +177,22 @@ def clip_path(root, split, sequence, number=1, run="run0"):
     return Path(root) / "cmu" / split / run / sequence / f"{sequence}_c{number:04d}"
 
 
-def write_clip(root, split, sequence, number=1, images=False, radial=True, run="run0", **changes):
-    """One clip's files, its fields as `make_clip` makes them with `changes`, or instead of them those of `fields`."""
+def write_clip(
+    root, split, sequence, number=1, images=False, video=False, radial=True, run="run0", **changes
+):
+    """One clip's files, its fields as `make_clip` makes them with `changes`, or instead of them those of `fields`.
+
+    With `images` it has depth and parts, with `video` colours and parts.
+    """
     given = changes.pop("fields", {})
     fields, vertices = make_clip(**changes)
     stem = clip_path(root, split, sequence, number, run)
     write_mat(stem.with_name(f"{stem.name}_info.mat"), {**fields, **given})
-    if images:
+    if images or video:
         depth, parts = make_images(fields, vertices, radial)
-        write_mat(stem.with_name(f"{stem.name}_depth.mat"), depth, compressed=True)
         write_mat(stem.with_name(f"{stem.name}_segm.mat"), parts, compressed=True)
+        if images:
+            write_mat(stem.with_name(f"{stem.name}_depth.mat"), depth, compressed=True)
+        if video:
+            write_video(stem.with_name(f"{stem.name}.mp4"), make_pictures(fields, parts))
     return fields
