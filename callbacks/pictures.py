@@ -1,7 +1,7 @@
 """Pictures of predictions: of fixed validation samples while training, of the extremes after a test."""
 
 import warnings
-from abc import abstractmethod
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from functools import wraps
 from pathlib import Path
@@ -40,30 +40,14 @@ def _never_stops(hook: Callable[..., None]) -> Callable[..., None]:
     return guarded
 
 
-class Pictures(Callback):
-    """Base: draws pages of samples. A subclass says what to keep of a sample, how bad it is and how it looks.
-
-    Files go below `directory`, and to W&B where it is among the loggers. A picture that cannot be drawn warns
-    once and never stops a run.
+class View(ABC):
+    """How a stage's samples are looked at: what is kept of each, how bad it is, how it is drawn.
 
     Attributes:
         inputs: Entries that are drawn of a batch which has them, too large to be kept of every test sample.
-
-    Args:
-        directory: Where pictures go.
-        num_samples: Validation samples (the first ones) and test samples of each kind to draw.
-        every_n_epochs: Epochs between two validation pictures.
     """
 
     inputs: ClassVar[tuple[str, ...]] = ("points", "crop", "crop_camera")
-
-    def __init__(self, directory: str | Path, num_samples: int = 4, every_n_epochs: int = 5) -> None:
-        self.directory = Path(directory)
-        self.num_samples = num_samples
-        self.every_n_epochs = every_n_epochs
-        self.has_warned = False
-        self._validation: list[dict[str, Tensor]] = []
-        self._test: list[dict[str, Tensor]] = []
 
     @abstractmethod
     def keep(self, outputs: dict[str, Tensor], batch: Any, module: Any) -> dict[str, Tensor]:
@@ -79,6 +63,27 @@ class Pictures(Callback):
         """What follows an error in a title."""
         return "mm"
 
+
+class Pictures(Callback):
+    """Draws pages of samples, each stage's in its own way (`VIEWS`).
+
+    Files go below `directory`, and to W&B where it is among the loggers. A picture that cannot be drawn warns
+    once and never stops a run.
+
+    Args:
+        directory: Where pictures go.
+        num_samples: Validation samples (the first ones) and test samples of each kind to draw.
+        every_n_epochs: Epochs between two validation pictures.
+    """
+
+    def __init__(self, directory: str | Path, num_samples: int = 4, every_n_epochs: int = 5) -> None:
+        self.directory = Path(directory)
+        self.num_samples = num_samples
+        self.every_n_epochs = every_n_epochs
+        self.has_warned = False
+        self._validation: list[dict[str, Tensor]] = []
+        self._test: list[dict[str, Tensor]] = []
+
     @_never_stops
     def on_validation_batch_end(
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, *_: int
@@ -88,8 +93,9 @@ class Pictures(Callback):
         is_wanted = trainer.is_global_zero and trainer.state.fn == TrainerFn.FITTING and self._is_due(trainer)
         if not is_wanted or missing <= 0:
             return
-        values = {name: batch[name] for name in ("sample_id", *self.inputs) if name in batch}
-        values |= self.keep(outputs, batch, pl_module)
+        view = _view(pl_module)
+        values = {name: batch[name] for name in ("sample_id", *view.inputs) if name in batch}
+        values |= view.keep(outputs, batch, pl_module)
         self._validation.append({name: value[:missing].detach().cpu() for name, value in values.items()})
 
     @_never_stops
@@ -99,9 +105,7 @@ class Pictures(Callback):
         if batches:
             samples = join_batches(batches)
             numbers = [f"sample {int(number)}" for number in samples["sample_id"]]
-            figure = self.draw(
-                samples, self._titles(numbers, samples, pl_module), self.num_samples, pl_module
-            )
+            figure = _page(samples, numbers, self.num_samples, pl_module)
             self._save(trainer, figure, "val/samples", f"val_epoch_{trainer.current_epoch + 1:03d}.png")
 
     @_never_stops
@@ -109,7 +113,7 @@ class Pictures(Callback):
         self, trainer: Trainer, pl_module: LightningModule, outputs: Any, batch: Any, *_: int
     ) -> None:
         """Keep something of every sample."""
-        values = self.keep(outputs, batch, pl_module) | {"sample_id": batch["sample_id"]}
+        values = _view(pl_module).keep(outputs, batch, pl_module) | {"sample_id": batch["sample_id"]}
         self._test.append({name: value.detach().cpu() for name, value in values.items()})
 
     @_never_stops
@@ -127,14 +131,10 @@ class Pictures(Callback):
         drawn = {name: value[chosen] for name, value in samples.items()}
         read: Any = trainer.test_dataloaders
         again = read.dataset.__getitems__(drawn["sample_id"].tolist())
-        drawn |= {name: again[name] for name in self.inputs if name in again}
+        drawn |= {name: again[name] for name in _view(pl_module).inputs if name in again}
         names = [kind for kind, indices in kinds.items() for _ in indices]
-        figure = self.draw(drawn, self._titles(names, drawn, pl_module), number, pl_module)
+        figure = _page(drawn, names, number, pl_module)
         self._save(trainer, figure, "test/extremes", layout.EXTREMES)
-
-    def _titles(self, names: Sequence[str], samples: dict[str, Tensor], module: Any) -> list[str]:
-        errors = samples["error"].tolist()
-        return [f"{name}: {error:.0f} {self.unit(module)}" for name, error in zip(names, errors)]
 
     def _is_due(self, trainer: Trainer) -> bool:
         epoch = trainer.current_epoch + 1
@@ -149,37 +149,37 @@ class Pictures(Callback):
                 logger.log_image(key, [str(path)])
 
 
-class JointPictures(Pictures):
-    """Clouds with true (blue) and predicted (red) skeletons, from the front and from the side; see `Pictures`.
+class JointView(View):
+    """Clouds with true (blue) and predicted (red) skeletons, from the front and from the side; see `View`.
 
     Joints that are only defined relative to the root are moved to the true root first.
     """
 
     def keep(self, outputs: dict[str, Tensor], batch: Batch, module: Any) -> dict[str, Tensor]:
-        """See `Pictures.keep`."""
+        """See `View.keep`."""
         pred_joints, joints = outputs["pred_joints"], batch["joints"]
         if module.is_root_relative:
             pred_joints = pred_joints + (joints - pred_joints)[:, ROOT, None]
         return {"error": mpjpe(pred_joints, joints), "pred_joints": pred_joints, "joints": joints}
 
     def unit(self, module: Any) -> str:
-        """See `Pictures.unit`."""
+        """See `View.unit`."""
         return "mm, root-aligned" if module.is_root_relative else "mm"
 
     def draw(
         self, samples: dict[str, Tensor], titles: Sequence[str], num_columns: int, module: Any
     ) -> "Figure":
-        """See `Pictures.draw`."""
+        """See `View.draw`."""
         joints, pred_joints = samples["joints"].numpy(), samples["pred_joints"].numpy()
         rows = zip(clouds(samples), joints, pred_joints, titles)
         return draw_samples([Sample(*row) for row in rows], num_columns)
 
 
-class MeshPictures(Pictures):
-    """Predicted (red) beside true (blue) meshes with the cloud over them, front and side; see `Pictures`."""
+class MeshView(View):
+    """Predicted (red) beside true (blue) meshes with the cloud over them, front and side; see `View`."""
 
     def keep(self, outputs: dict[str, Tensor], batch: Batch, module: Any) -> dict[str, Tensor]:
-        """See `Pictures.keep`: parameters and roots, from which the meshes are made again."""
+        """See `View.keep`: parameters and roots, from which the meshes are made again."""
         roots = {"pred_root": outputs["pred_joints"][:, ROOT], "root": batch["joints"][:, ROOT]}
         parameters = {name: outputs[name] for name in ("pred_pose", "pred_betas")}
         truth = {"pose": batch["pose"], "betas": batch["betas"], "gender": batch["gender"]}
@@ -189,7 +189,7 @@ class MeshPictures(Pictures):
     def draw(
         self, samples: dict[str, Tensor], titles: Sequence[str], num_columns: int, module: Any
     ) -> "Figure":
-        """See `Pictures.draw`."""
+        """See `View.draw`."""
         on_device = {name: value.to(module.device) for name, value in samples.items()}
         meshes = []
         for layer, names, root in (
@@ -202,13 +202,13 @@ class MeshPictures(Pictures):
         return draw_meshes([MeshSample(*row) for row in rows], module.body.faces.cpu().numpy(), num_columns)
 
 
-class KeypointPictures(Pictures):
-    """Crops with true (blue) and predicted (red) 2D skeletons; see `Pictures`."""
+class KeypointView(View):
+    """Crops with true (blue) and predicted (red) 2D skeletons; see `View`."""
 
     inputs = ("rgb", "crop")
 
     def keep(self, outputs: dict[str, Tensor], batch: Batch, module: Any) -> dict[str, Tensor]:
-        """See `Pictures.keep`."""
+        """See `View.keep`."""
         crop_camera = module.observation(batch)[1]
         return {
             "error": outputs["crop_error_px"],
@@ -217,14 +217,28 @@ class KeypointPictures(Pictures):
         }
 
     def unit(self, module: Any) -> str:
-        """See `Pictures.unit`."""
+        """See `View.unit`."""
         return "px"
 
     def draw(
         self, samples: dict[str, Tensor], titles: Sequence[str], num_columns: int, module: Any
     ) -> "Figure":
-        """See `Pictures.draw`."""
+        """See `View.draw`."""
         images = samples["rgb"].permute(0, 2, 3, 1) if "rgb" in samples else samples["crop"]
         keypoints, pred_keypoints = samples["keypoints"].numpy(), samples["pred_keypoints"].numpy()
         rows = zip(images.numpy(), keypoints, pred_keypoints, titles)
         return draw_keypoints([CropSample(*row) for row in rows], num_columns)
+
+
+VIEWS: dict[str, View] = {"detector": JointView(), "mesh": MeshView(), "keypoints": KeypointView()}
+"""By stage."""
+
+
+def _view(module: Any) -> View:
+    return VIEWS[module.stage]
+
+
+def _page(samples: dict[str, Tensor], names: Sequence[str], num_columns: int, module: Any) -> "Figure":
+    view, errors = _view(module), samples["error"].tolist()
+    titles = [f"{name}: {error:.0f} {view.unit(module)}" for name, error in zip(names, errors)]
+    return view.draw(samples, titles, num_columns, module)

@@ -2,6 +2,7 @@
 
 import logging
 from pathlib import Path
+from typing import Any
 
 import torch
 from hydra import compose
@@ -76,8 +77,8 @@ def _earlier_stages(cfg: DictConfig) -> Checkpoint | None:
         return None
     argument = "task.begins_with"
     if begins_with in shipped() or is_package(begins_with):
-        stage = get_class(cfg.module._target_).stage
-        return read_checkpoint(find_package(begins_with, argument), argument, stage)
+        module: Any = get_class(cfg.module._target_)
+        return read_checkpoint(find_package(begins_with, argument), argument, module.stage)
     if Path(begins_with).suffix == Path(layout.BEST_CHECKPOINT).suffix:
         return read_checkpoint(begins_with, argument)
     return read_checkpoint(trained(composed(begins_with, is_same_stage=True), begins_with), argument)

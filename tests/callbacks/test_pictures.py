@@ -3,12 +3,12 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from callbacks.pictures import JointPictures
+from callbacks.pictures import VIEWS, JointView, Pictures
 from ljn.body.skeleton import NUM_JOINTS, ROOT
 from ljn.metrics import mpjpe_root_aligned
 
 
-class Drawn(JointPictures):
+class Drawn(JointView):
     """Keeps what it is to draw."""
 
     def draw(self, samples, titles, num_columns, module):
@@ -17,7 +17,7 @@ class Drawn(JointPictures):
 
 
 @pytest.fixture
-def draw_extremes(tmp_path):
+def draw_extremes(tmp_path, monkeypatch):
     """The page after a test of three samples: those with the best shapes have their roots farthest off."""
 
     def draw(is_root_relative):
@@ -31,29 +31,31 @@ def draw_extremes(tmp_path):
         trainer = SimpleNamespace(
             is_global_zero=True, loggers=[], test_dataloaders=SimpleNamespace(dataset=dataset)
         )
-        module = SimpleNamespace(is_root_relative=is_root_relative)
+        module = SimpleNamespace(stage="detector", is_root_relative=is_root_relative)
         batch = {"sample_id": torch.arange(3), "joints": joints}
-        pictures = Drawn(tmp_path, num_samples=1)
+        view = Drawn()
+        monkeypatch.setitem(VIEWS, "detector", view)
+        pictures = Pictures(tmp_path, num_samples=1)
         pictures.on_test_batch_end(trainer, module, {"pred_joints": pred_joints}, batch, 0)
         pictures.on_test_end(trainer, module)
         assert (tmp_path / "test_best_median_worst.png").is_file()
-        return pictures, pred_joints, joints
+        return view, pred_joints, joints
 
     return draw
 
 
 def test_joints_are_ranked_and_drawn_where_they_were_predicted(draw_extremes):
-    pictures, pred_joints, _ = draw_extremes(is_root_relative=False)
-    assert pictures.samples["sample_id"].tolist() == [2, 1, 0]
-    assert torch.equal(pictures.samples["pred_joints"], pred_joints[[2, 1, 0]])
-    assert all(title.endswith(" mm") for title in pictures.titles)
+    view, pred_joints, _ = draw_extremes(is_root_relative=False)
+    assert view.samples["sample_id"].tolist() == [2, 1, 0]
+    assert torch.equal(view.samples["pred_joints"], pred_joints[[2, 1, 0]])
+    assert all(title.endswith(" mm") for title in view.titles)
 
 
 def test_root_relative_joints_are_ranked_and_drawn_after_moving_the_roots(draw_extremes):
-    pictures, pred_joints, joints = draw_extremes(is_root_relative=True)
-    assert pictures.samples["sample_id"].tolist() == [0, 1, 2]
+    view, pred_joints, joints = draw_extremes(is_root_relative=True)
+    assert view.samples["sample_id"].tolist() == [0, 1, 2]
     torch.testing.assert_close(
-        pictures.samples["error"], mpjpe_root_aligned(pred_joints, joints), rtol=1e-4, atol=0
+        view.samples["error"], mpjpe_root_aligned(pred_joints, joints), rtol=1e-4, atol=0
     )
-    torch.testing.assert_close(pictures.samples["pred_joints"][:, ROOT], joints[:, ROOT])
-    assert pictures.titles[0] == "best: 17 mm, root-aligned"
+    torch.testing.assert_close(view.samples["pred_joints"][:, ROOT], joints[:, ROOT])
+    assert view.titles[0] == "best: 17 mm, root-aligned"
