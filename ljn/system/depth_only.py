@@ -1,6 +1,6 @@
 """The person's pixels in depth alone, without a curtain."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import cv2
@@ -77,6 +77,16 @@ class DepthOnly:
         self.facts: dict[str, object] = {}
         self._last = None if seed is None else np.array(seed, float)
         self._last_s = -np.inf if seed is None else np.inf
+
+    @property
+    def state(self) -> dict[str, np.ndarray]:
+        """Where the person was, as arrays by name: to go on from."""
+        return {} if self._last is None else {"place": self._last, "seconds": np.array(self._last_s)}
+
+    @state.setter
+    def state(self, state: Mapping[str, np.ndarray]) -> None:
+        self._last = state.get("place")
+        self._last_s = float(state.get("seconds", -np.inf))
 
     def __call__(self, frame: RgbdFrame, camera: Camera) -> np.ndarray:
         """The person's pixels.

@@ -108,7 +108,7 @@ def test_what_cannot_be_is_named(compose_config, tmp_path):
 
 def test_a_recording_without_a_person_is_an_error_that_says_why(recording, compose_config, tmp_path):
     recording.depth = recording.depth * 0
-    with pytest.raises(ValueError, match=r"none of 5 frames could be predicted: depth: all pixels are 0"):
+    with pytest.raises(ValueError, match=r"none of 5 frames could be predicted: 4 x depth: all pixels are 0"):
         ar(config(compose_config, tmp_path))
 
 
