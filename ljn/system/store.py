@@ -74,7 +74,8 @@ class Store:
             for path in folder.iterdir():
                 if path.stem.partition("-")[0] not in kept:
                     path.unlink()
-        write_json(directory / _SETTINGS, settings)
+        if not is_same:
+            write_json(directory / _SETTINGS, settings)
 
     def _found(self) -> list[int]:
         """The numbers of the frames that are there, up to the first that is missing."""

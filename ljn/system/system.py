@@ -4,7 +4,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -25,9 +25,14 @@ _GAP_S = 0.5  # after a longer one, nothing is smoothed over it
 _SMOOTHER, _SEGMENTER = "smoother_", "segmenter_"  # what is theirs of the state
 
 Segmenter = Callable[[RgbdFrame, Camera], np.ndarray]
-"""Finds the person: a frame and its camera in, a mask `(H, W)` bool out; a `ValueError` where there is none.
+"""Finds the person: a frame and its camera in, a mask `(H, W)` bool out; a `ValueError` where there is none."""
 
-One that remembers frames has a `state`, arrays by name, that can be set."""
+
+@runtime_checkable
+class Remembering(Protocol):
+    """A segmenter that remembers the frames before: `state` is what, as arrays by name, to go on from."""
+
+    state: dict[str, np.ndarray]
 
 
 class ArResult(NamedTuple):
@@ -136,7 +141,7 @@ class ArSystem:
             }
         if self.smoother is not None:
             state |= {f"{_SMOOTHER}{name}": value for name, value in self.smoother.state.items()}
-        if hasattr(self.segmenter, "state"):
+        if isinstance(self.segmenter, Remembering):
             state |= {f"{_SEGMENTER}{name}": value for name, value in self.segmenter.state.items()}
         return state
 
@@ -149,7 +154,7 @@ class ArSystem:
             self.judge = FlipJudge(state["judge_joints"], *numbers)
         if self.smoother is not None:
             self.smoother.state = _part(state, _SMOOTHER)
-        if hasattr(self.segmenter, "state"):
+        if isinstance(self.segmenter, Remembering):
             self.segmenter.state = _part(state, _SEGMENTER)
 
     def _time(self, frame: RgbdFrame) -> float:

@@ -40,6 +40,7 @@ from ljn.tasks.validation import check_writable
 
 _LOG = logging.getLogger(__name__)
 _FPS = 30.0  # of videos of recordings whose rate nobody knows
+_RESULTS = "ar"
 _VIDEO, _SHEET, _MOTION, _SUMMARY, _PAGE = (
     "overlay.mp4",
     "overview.jpg",
@@ -86,9 +87,9 @@ def ar(cfg: DictConfig) -> dict[str, float]:
         smoothing = SmoothingSettings(**(OmegaConf.to_container(task.smoothing) or {}))  # type: ignore[arg-type]
     if cfg.num_threads is not None:
         torch.set_num_threads(cfg.num_threads)
-    pipeline = _pipeline(cfg, recording)
+    pipeline = _pipeline(cfg)
     segmenter = None if cfg.segmentation is None else build(cfg.segmentation)
-    directory = Path(cfg.paths.output_dir) / "ar" / _name(cfg, recording)
+    directory = Path(cfg.paths.output_dir) / _RESULTS / _name(cfg, recording)
     check_writable(directory)
     stages = (pipeline.detector, pipeline.regressor, pipeline.finder.stage if pipeline.finder else None)
     settings = {
@@ -160,7 +161,7 @@ def _recording(cfg: DictConfig) -> Any:
         raise ValueError(str(error)) from error
 
 
-def _pipeline(cfg: DictConfig, recording: Recording) -> Pipeline:
+def _pipeline(cfg: DictConfig) -> Pipeline:
     """The pipeline of the weights that a call names, or of those that ship."""
     task = cfg.task
     if cfg.weights is None and cfg.ckpt_path is None and DEFAULT in shipped():
@@ -195,7 +196,7 @@ def _identity(cfg: DictConfig, recording: Recording) -> dict[str, Any]:
     given = [cfg.task.input, cfg.task.camera, cfg.task.rgb_camera]
     if cfg.segmentation is not None:
         given.append(cfg.segmentation.get("plate"))
-    results, digest = Path(cfg.paths.output_dir).resolve(), hashlib.sha256()
+    results, digest = (Path(cfg.paths.output_dir) / _RESULTS).resolve(), hashlib.sha256()
     for root in (Path(each).resolve() for each in given if each is not None):
         for path in [root, *sorted(root.rglob("*"))]:
             if path.is_file() and not path.is_relative_to(results):
@@ -295,7 +296,7 @@ def _finish(
     summary = {"recording": recording.facts, **summarise(frames)}
     # Of a live sensor, as fast as frames were taken from it.
     fps = frames_a_second([frame["timestamp_s"] for frame in frames]) or recording.fps or _FPS
-    for name in _MADE:
+    for name in (*_MADE, _PAGE):
         (store.directory / name).unlink(missing_ok=True)
     write_video(store.directory / _VIDEO, store.read_pictures(), fps)
     if pictures := list(store.read_pictures(_SHOWN)):
