@@ -41,14 +41,8 @@ from ljn.tasks.validation import check_writable
 _LOG = logging.getLogger(__name__)
 _FPS = 30.0  # of videos of recordings whose rate nobody knows
 _RESULTS = "ar"
-_VIDEO, _SHEET, _MOTION, _SUMMARY, _PAGE = (
-    "overlay.mp4",
-    "overview.jpg",
-    "motion",
-    "summary.json",
-    "index.html",
-)
-_MADE = (_VIDEO, _SHEET, *(f"{_MOTION}{suffix}" for suffix, _ in WRITERS.values()), f"{_MOTION}.glb")
+_VIDEO, _SHEET, _SUMMARY, _PAGE = "overlay.mp4", "overview.jpg", "summary.json", "index.html"
+_MOTIONS, _GLB = [f"motion{suffix}" for suffix, _ in WRITERS.values()], "motion.glb"
 _SHOWN, _COLUMNS = 8, 4  # frames of the overview
 _TOLD = 3  # errors that are said at the end
 _COMMAND = "python run.py task=ar input=RECORDING"
@@ -214,7 +208,7 @@ def _total(recording: Recording, task: DictConfig) -> int | None:
 def _complete(store: Store, total: int | None) -> dict[str, Any] | None:
     """The summary of what is complete; None where frames are to be predicted, or files of them to be made."""
     summary = read_json(store.directory / _SUMMARY)
-    if summary is None or summary["frames"] != store.num_done:
+    if not store.num_done or summary is None or summary["frames"] != store.num_done:
         return None
     is_over = "ended" in summary["recording"] or (total is not None and store.num_done >= total)
     has_all = all((store.directory / name).is_file() for name in summary["files"])
@@ -224,11 +218,11 @@ def _complete(store: Store, total: int | None) -> dict[str, Any] | None:
 def _run(system: ArSystem, recording: Any, store: Store, task: DictConfig) -> None:
     """Predict and write frame by frame, from the first that is not done."""
     done, total = store.num_done, _total(recording, task)
+    if total is not None and done >= total:
+        return
     if done:
         _LOG.info("going on after %d frames that are done: %s", done, store.directory)
         system.state = store.read(done - 1).state
-    if total is not None and done >= total:
-        return
     has_truth = hasattr(recording, "truth")
     begin = time.perf_counter()
     with (
@@ -296,19 +290,22 @@ def _finish(
     summary = {"recording": recording.facts, **summarise(frames)}
     # Of a live sensor, as fast as frames were taken from it.
     fps = frames_a_second([frame["timestamp_s"] for frame in frames]) or recording.fps or _FPS
-    for name in (*_MADE, _PAGE):
-        (store.directory / name).unlink(missing_ok=True)
-    write_video(store.directory / _VIDEO, store.read_pictures(), fps)
-    if pictures := list(store.read_pictures(_SHOWN)):
-        Image.fromarray(contact_sheet(pictures, _COLUMNS)).save(store.directory / _SHEET, quality=90)
+    files = []
+    if write_video(store.directory / _VIDEO, store.read_pictures(), fps):
+        Image.fromarray(contact_sheet(list(store.read_pictures(_SHOWN)), _COLUMNS)).save(
+            store.directory / _SHEET, quality=90
+        )
+        files = [_VIDEO, _SHEET]
     if pipeline.regressor is not None and any(frame is not None for frame in posed):
         motion = body_motion(posed, pipeline.regressor.module.body, fps)
-        for suffix, write in WRITERS.values():
-            write(store.directory / f"{_MOTION}{suffix}", motion)
-        write_glb(store.directory / f"{_MOTION}.glb", motion, pipeline.regressor.module.body)
-    summary["files"] = [name for name in _MADE if (store.directory / name).is_file()]
-    if frames:
-        write_text_atomically(store.directory / _PAGE, page(recording.name, summary, frames, _SUMMARY))
+        for name, (_, write) in zip(_MOTIONS, WRITERS.values()):
+            write(store.directory / name, motion)
+        write_glb(store.directory / _GLB, motion, pipeline.regressor.module.body)
+        files += [*_MOTIONS, _GLB]
+    for name in {_VIDEO, _SHEET, *_MOTIONS, _GLB} - set(files):  # of other settings
+        (store.directory / name).unlink(missing_ok=True)
+    summary["files"] = files
+    write_text_atomically(store.directory / _PAGE, page(recording.name, summary, frames, _SUMMARY))
     # The last: with it, all is complete.
     write_json(store.directory / _SUMMARY, {**summary, "settings": settings, "per_frame": frames})
     return summary

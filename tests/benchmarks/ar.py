@@ -1,24 +1,31 @@
 """The AR system on the synthetic recording: silhouettes, errors and jitter by where joints come from; and its speed.
 
     python -m tests.benchmarks.ar [--frames N] [--keypoint-detector FILE_OR_NAME ...] [--refine fast]
-    python -m tests.benchmarks.ar --flips [--frames N] [--keypoint-detector FILE_OR_NAME ...]
+    python -m tests.benchmarks.ar --flips [--clip CLIP] [--frames N] [--keypoint-detector FILE_OR_NAME ...]
+    python -m tests.benchmarks.ar --memory 2000
 
 The first prints a table: the mesh's silhouette against the true mask (IoU), MPJPE and PVE, with true 3D joints (the
 ceiling: what the mesh regressor makes of them), true 2D joints, the 2D joints of keypoint detectors, and none; each
 without smoothing and with it; jitter is the mean acceleration error of the joints.
 
-The second exchanges the sides of the 2D joints in some frames, and prints what becomes of them.
+The second exchanges the sides of the 2D joints in some frames, and prints what becomes of them. The third runs
+`task=ar` over so many frames, and prints its resident memory on the way.
 """
 
 import argparse
+import subprocess
+import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 import torch
 from hydra import compose, initialize_config_dir
 
+from datamodules.recording import write_recording
 from ljn.body.skeleton import MIRROR
 from ljn.building import build
 from ljn.metrics import apve, mpjpe
@@ -51,6 +58,7 @@ def main() -> None:
     parser.add_argument("--refine", default=None)
     parser.add_argument("--segmentation", default="curtain")
     parser.add_argument("--flips", action="store_true")
+    parser.add_argument("--memory", type=int)
     parser.add_argument("--clip", default="humanoid3d_dance_b")
     given = parser.parse_args()
     register()
@@ -59,6 +67,9 @@ def main() -> None:
     with initialize_config_dir(conf, version_base="1.3"):
         cfg = compose("config", ["task=ar", "recording=synthetic", *chosen])
     recording = build(cfg.recording)
+    if given.memory is not None:
+        print_memory(recording, given.memory)
+        return
     frames = [frame for _, frame in zip(range(given.frames), recording.frames())]
     truths = [recording.truth(frame.number) for frame in frames]
     if given.flips:
@@ -134,6 +145,9 @@ def _accelerations(results: list[Any], truths: list[Any], fps: float) -> Iterato
 def _seconds(results: list[Any]) -> list[tuple[str, float]]:
     stages = list(results[-1].seconds)
     return [(stage, float(np.median([each.seconds[stage] for each in results]))) for stage in stages]
+
+
+_WRITTEN = 20  # frames that a long recording repeats
 
 
 class _Exchanging:
@@ -238,6 +252,41 @@ def print_flips(recording: Any, frames: list[Any], truths: list[Any], segmenter:
                 + f" | {1000 * errors[0]:.1f} | {1000 * errors[1]:.1f} |",
                 flush=True,
             )
+
+
+def print_memory(recording: Any, number: int) -> None:
+    """What `task=ar` holds in memory after so many frames, as Linux counts it, and at most, to its end."""
+    with TemporaryDirectory() as folder:
+        source, long, results = (Path(folder) / name for name in ("source", "long", "results"))
+        write_recording(recording, source, _WRITTEN)
+        for kind in ("depth", "rgb"):
+            (long / kind).mkdir(parents=True)
+            for i in range(number):  # to the end and back
+                row = _WRITTEN - 1 - abs(_WRITTEN - 1 - i % (2 * _WRITTEN - 2))
+                (long / kind / f"{i:06d}.png").hardlink_to(source / kind / f"{row:06d}.png")
+        (source / "camera.yaml").rename(long / "camera.yaml")
+        command = [sys.executable, "run.py", "task=ar", f"input={long}", "segmentation=curtain"]
+        command += ["task.smooth=true", "trainer.accelerator=cpu", f"paths.output_dir={results}"]
+        with subprocess.Popen(command, cwd=Path(__file__).parents[2]) as process:
+            print("\n| frames | resident, MB |\n|---:|---:|", flush=True)
+            most = 0
+            for mark in [100, *range(500, number + 1, 500)]:
+                while process.poll() is None and not list(results.glob(f"ar/*/frames/{mark - 1:06d}.npz")):
+                    time.sleep(0.2)
+                print(f"| {mark} | {_resident(process.pid, 'VmRSS')} |", flush=True)
+            while process.poll() is None:
+                most = max(most, _resident(process.pid, "VmHWM"))
+                time.sleep(0.2)
+            print(f"| the most, with video and motion | {most} |")
+
+
+def _resident(pid: int, key: str) -> int:
+    """A line of a process's status, MB; 0 once it is over."""
+    try:
+        lines = Path(f"/proc/{pid}/status").read_text().splitlines()
+    except OSError:
+        return 0
+    return sum(int(line.split()[1]) // 1024 for line in lines if line.startswith(f"{key}:"))
 
 
 def _is_flipped(joints: np.ndarray, true: np.ndarray) -> bool:
