@@ -149,9 +149,11 @@ class ArSystem:
     def state(self, state: Mapping[str, np.ndarray]) -> None:
         self._number, self._now_s = int(state["number"]), float(state["now_s"])
         self._smoothed_s = float(state["smoothed_s"]) if "smoothed_s" in state else None
-        if self.judge is not None and "judge_joints" in state:
-            numbers = float(state["judge_seconds"]), int(state["judge_corrected"])
-            self.judge = FlipJudge(state["judge_joints"], *numbers)
+        if self.judge is not None:
+            self.judge = FlipJudge()
+            if "judge_joints" in state:
+                numbers = float(state["judge_seconds"]), int(state["judge_corrected"])
+                self.judge = FlipJudge(state["judge_joints"], *numbers)
         if self.smoother is not None:
             self.smoother.state = _part(state, _SMOOTHER)
         if isinstance(self.segmenter, Remembering):
@@ -175,9 +177,9 @@ class ArSystem:
     @torch.inference_mode()
     def _smoothed(self, prediction: Prediction, seconds: float) -> Prediction:
         """A prediction smoothed over the frames before, its mesh made anew."""
-        last, self._smoothed_s = self._smoothed_s, seconds
         if self.smoother is None:
             return prediction
+        last, self._smoothed_s = self._smoothed_s, seconds
         if last is None or not 0 < seconds - last <= _GAP_S:
             self.smoother.forget()
             last = seconds - 1 / self.fps

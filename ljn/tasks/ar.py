@@ -101,6 +101,7 @@ def ar(cfg: DictConfig) -> dict[str, float]:
     if summary is not None:
         _LOG.info("%s is complete; predict it again with rerun=true", directory)
     else:
+        (directory / _SUMMARY).unlink(missing_ok=True)  # until all is made, nothing is complete
         system = ArSystem(pipeline, recording.camera, segmenter, smoothing, task.mend_flips, recording.fps)
         try:
             _run(system, recording, store, task)

@@ -1,7 +1,7 @@
 """The AR system on the synthetic recording: silhouettes, errors and jitter by where joints come from; and its speed.
 
     python -m tests.benchmarks.ar [--frames N] [--keypoint-detector FILE_OR_NAME ...] [--refine fast]
-    python -m tests.benchmarks.ar --flips [--clip CLIP] [--frames N] [--keypoint-detector FILE_OR_NAME ...]
+    python -m tests.benchmarks.ar --flips [--clip CLIP] [--start N] [--frames N] [--keypoint-detector FILE_OR_NAME ...]
     python -m tests.benchmarks.ar --memory 2000
 
 The first prints a table: the mesh's silhouette against the true mask (IoU), MPJPE and PVE, with true 3D joints (the
@@ -60,9 +60,11 @@ def main() -> None:
     parser.add_argument("--flips", action="store_true")
     parser.add_argument("--memory", type=int)
     parser.add_argument("--clip", default="humanoid3d_dance_b")
+    parser.add_argument("--start", type=int, default=0)
     given = parser.parse_args()
     register()
     chosen = [f"segmentation={given.segmentation}", f"recording.clip={given.clip}"]
+    chosen += [f"recording.start={given.start}"]
     conf = str(Path(__file__).parents[2] / "conf")
     with initialize_config_dir(conf, version_base="1.3"):
         cfg = compose("config", ["task=ar", "recording=synthetic", *chosen])
