@@ -29,10 +29,16 @@ Segmenter = Callable[[RgbdFrame, Camera], np.ndarray]
 
 
 @runtime_checkable
-class Remembering(Protocol):
-    """A segmenter that remembers the frames before: `state` is what, as arrays by name, to go on from."""
+class Following(Protocol):
+    """A segmenter that follows the person from frame to frame.
+
+    Attributes:
+        state: What it remembers, as arrays by name, to go on from.
+        doubts: About who it is, in the last frame.
+    """
 
     state: dict[str, np.ndarray]
+    doubts: list[str]
 
 
 class ArResult(NamedTuple):
@@ -106,6 +112,9 @@ class ArSystem:
             with watch("segmentation"):
                 if self.segmenter is not None:
                     mask = self.segmenter(frame._replace(timestamp_s=seconds), self.camera)
+                if isinstance(self.segmenter, Following):
+                    for doubt in self.segmenter.doubts:
+                        report.doubt(doubt)
             with watch("2D joints"):
                 observed = self.pipeline.observe(
                     frame.depth, self.camera, keypoints, mask, report, rgb=frame.rgb
@@ -141,7 +150,7 @@ class ArSystem:
             }
         if self.smoother is not None:
             state |= {f"{_SMOOTHER}{name}": value for name, value in self.smoother.state.items()}
-        if isinstance(self.segmenter, Remembering):
+        if isinstance(self.segmenter, Following):
             state |= {f"{_SEGMENTER}{name}": value for name, value in self.segmenter.state.items()}
         return state
 
@@ -156,7 +165,7 @@ class ArSystem:
                 self.judge = FlipJudge(state["judge_joints"], *numbers)
         if self.smoother is not None:
             self.smoother.state = _part(state, _SMOOTHER)
-        if isinstance(self.segmenter, Remembering):
+        if isinstance(self.segmenter, Following):
             self.segmenter.state = _part(state, _SEGMENTER)
 
     def _time(self, frame: RgbdFrame) -> float:

@@ -126,7 +126,10 @@ def _told(summary: Mapping[str, Any], directory: Path) -> dict[str, float]:
         raise ValueError(
             f"input: none of {summary['frames']} frames could be predicted: {reasons} ({directory / _PAGE})"
         )
-    _LOG.info("%d of %d frames predicted: %s", summary["predicted"], summary["frames"], directory / _PAGE)
+    doubted = f", {summary['doubtful']} doubted" if summary["doubtful"] else ""
+    _LOG.info(
+        "%d of %d frames predicted%s: %s", summary["predicted"], summary["frames"], doubted, directory / _PAGE
+    )
     if reasons:
         _LOG.warning("%d frames failed: %s", summary["failed"], reasons)
     metrics: dict[str, float] = {

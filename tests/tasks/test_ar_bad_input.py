@@ -103,7 +103,7 @@ def nobody_for_a_while(folder):
     folder.empty([2, 3])
 
 
-def two_persons(folder):
+def two_persons(folder, numbers=(3,)):
     # Somebody, 1.6 m beside somebody who looks alike.
     for kind in ("depth", "rgb"):
 
@@ -114,7 +114,7 @@ def two_persons(folder):
                 both[moved] = np.roll(image, shift, 1)[moved]
             return both
 
-        folder.change(kind, doubled, [3])
+        folder.change(kind, doubled, numbers)
 
 
 def cut_short(folder):
@@ -271,6 +271,26 @@ def test_frames_that_fail_are_told_and_the_others_are_done(
     else:
         assert summary["recording"]["jumps_in_time"] == summary["recording"]["times_that_go_back"] == 1
         assert "jumps in time" in page
+
+
+def test_of_two_persons_in_a_room_it_is_doubted_who_is_meant(
+    compose_config, good, pipeline, monkeypatch, tmp_path
+):
+    monkeypatch.setattr("ljn.tasks.ar._pipeline", lambda *_: pipeline)
+    folder = Folder(tmp_path / "damaged", good)
+    two_persons(folder, range(NUM))
+    metrics = run(compose_config, tmp_path, folder.path, "segmentation=depth_only")
+    assert metrics["ar/failed"] == 0
+    _, summary, page = left(tmp_path)
+    assert "2 things have a person's size and shape" in summary["per_frame"][0]["warnings"][0]
+    assert "segmentation.seed" in page
+    # Told who is meant, there is no doubt about that.
+    run(compose_config, tmp_path, folder.path, "segmentation=depth_only", "segmentation.seed=[0.8,0,2.2]")
+    directory, _, page = left(tmp_path)
+    assert "things have a person's size and shape" not in page
+    truth = np.load(good / "person" / "truth.npz")["joints"]
+    found = np.load(directory / "frames" / "000005.npz")["joints"]
+    assert found[0, 0] - truth[5, 0, 0] == pytest.approx(0.8, abs=0.2), "the one to the right"
 
 
 def test_a_sensor_that_stops_leaves_what_it_has_given(compose_config, good, pipeline, monkeypatch, tmp_path):
