@@ -22,7 +22,7 @@ from ljn.system.smoothing import PoseSmoother, SmoothingSettings
 
 _FPS = 30.0  # of a recording whose rate nobody knows
 _GAP_S = 0.5  # after a longer one, nothing is smoothed over it
-_SMOOTHER, _SEGMENTER = "smoother_", "segmenter_"  # what is theirs of the state
+_JUDGE, _SMOOTHER, _SEGMENTER = "judge_", "smoother_", "segmenter_"  # what is theirs of the state
 
 Segmenter = Callable[[RgbdFrame, Camera], np.ndarray]
 """Finds the person: a frame and its camera in, a mask `(H, W)` bool out; a `ValueError` where there is none."""
@@ -143,11 +143,7 @@ class ArSystem:
         if self._smoothed_s is not None:
             state["smoothed_s"] = np.array(self._smoothed_s)
         if self.judge is not None and self.judge.joints is not None:
-            state |= {
-                "judge_joints": self.judge.joints,
-                "judge_seconds": np.array(self.judge.seconds),
-                "judge_corrected": np.array(self.judge.num_corrected),
-            }
+            state |= {f"{_JUDGE}{name}": np.array(value) for name, value in vars(self.judge).items()}
         if self.smoother is not None:
             state |= {f"{_SMOOTHER}{name}": value for name, value in self.smoother.state.items()}
         if isinstance(self.segmenter, Following):
@@ -159,10 +155,10 @@ class ArSystem:
         self._number, self._now_s = int(state["number"]), float(state["now_s"])
         self._smoothed_s = float(state["smoothed_s"]) if "smoothed_s" in state else None
         if self.judge is not None:
-            self.judge = FlipJudge()
-            if "judge_joints" in state:
-                numbers = float(state["judge_seconds"]), int(state["judge_corrected"])
-                self.judge = FlipJudge(state["judge_joints"], *numbers)
+            values = _part(state, _JUDGE)
+            self.judge = FlipJudge(
+                **{name: each if each.ndim else each.item() for name, each in values.items()}
+            )
         if self.smoother is not None:
             self.smoother.state = _part(state, _SMOOTHER)
         if isinstance(self.segmenter, Following):

@@ -130,6 +130,17 @@ def test_sides_of_the_first_frame_are_judged_by_the_depth(shipped, frame):
     assert FlipJudge()(right, 0.0, lambda _: wrong).prediction is right
 
 
+def test_sides_that_were_wrong_for_long_are_found_by_the_depth(shipped, frame):
+    depth, camera = frame
+    right = shipped(depth, camera)
+    wrong = replace(right, joints=right.joints[list(MIRROR)], vertices=right.vertices + 0.1)
+    judge = FlipJudge(joints=wrong.joints, seconds=0.0, compared_s=0.0)
+    flips = [judge(wrong, 0.2 * i, lambda _: right).flip for i in range(1, 6)]
+    assert flips == ["", "", "corrected", "corrected", "corrected"]
+    judge = FlipJudge(joints=right.joints, seconds=0.0, compared_s=0.0)
+    assert [judge(right, 0.2 * i, lambda _: wrong).flip for i in range(1, 6)] == [""] * 5
+
+
 def test_a_pipeline_without_a_mesh_has_joints_alone(shipped, frame):
     depth, camera = frame
     system = ArSystem(Pipeline(shipped.detector), camera, smoothing=SmoothingSettings())
