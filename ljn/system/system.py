@@ -155,10 +155,10 @@ class ArSystem:
         self._number, self._now_s = int(state["number"]), float(state["now_s"])
         self._smoothed_s = float(state["smoothed_s"]) if "smoothed_s" in state else None
         if self.judge is not None:
-            values = _part(state, _JUDGE)
-            self.judge = FlipJudge(
-                **{name: each if each.ndim else each.item() for name, each in values.items()}
-            )
+            values: dict[str, Any] = {
+                name: each if each.ndim else each.item() for name, each in _part(state, _JUDGE).items()
+            }
+            self.judge = FlipJudge(**values)
         if self.smoother is not None:
             self.smoother.state = _part(state, _SMOOTHER)
         if isinstance(self.segmenter, Following):
