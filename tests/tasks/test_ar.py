@@ -147,6 +147,15 @@ def test_what_cannot_be_is_named(compose_config, tmp_path):
         ar(config(compose_config, tmp_path))
 
 
+def test_a_sensor_that_cannot_be_opened_is_a_user_s_error(compose_config, tmp_path, monkeypatch):
+    def fails(*_):
+        raise RuntimeError("input: no camera can be opened: is it plugged in?")
+
+    monkeypatch.setattr("ljn.system.readers.open_recording", fails)
+    with pytest.raises(ValueError, match="is it plugged in"):
+        ar(config(compose_config, tmp_path, "task.input=live:realsense"))
+
+
 def test_a_recording_without_a_person_is_an_error_that_says_why(recording, compose_config, tmp_path):
     recording.depth = recording.depth * 0
     with pytest.raises(ValueError, match=r"none of 5 frames could be predicted: 4 x depth: all pixels are 0"):
