@@ -27,6 +27,7 @@ from ljn.render import get_renderer
 from ljn.runs.files import path_part, read_json, write_json, write_text_atomically
 from ljn.runs.packages import DEFAULT, shipped
 from ljn.system.overlay import draw_overlay
+from ljn.system.readers import open_recording
 from ljn.system.readers.timestamps import frames_a_second
 from ljn.system.recording import Recording
 from ljn.system.smoothing import SmoothingSettings
@@ -151,8 +152,6 @@ def _recording(cfg: DictConfig) -> Any:
         )
     if given is None:
         return build(cfg.recording)
-    from ljn.system.readers import open_recording
-
     try:
         return open_recording(given, cfg.task.camera, cfg.task.rgb_camera)
     except RuntimeError as error:  # a sensor that cannot be opened
@@ -291,7 +290,9 @@ def _finish(
         prediction = frame.prediction
         has_mesh = prediction is not None and prediction.pose is not None
         posed.append(PosedFrame.of(prediction) if prediction is not None and has_mesh else None)
-    summary = {"recording": recording.facts, **summarise(frames)}
+    # What could not be read is among the errors, that of earlier calls, too.
+    about = {name: value for name, value in recording.facts.items() if name != "unreadable"}
+    summary = {"recording": about, **summarise(frames)}
     # Of a live sensor, as fast as frames were taken from it.
     fps = frames_a_second([frame["timestamp_s"] for frame in frames]) or recording.fps or _FPS
     files = []

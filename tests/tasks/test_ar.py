@@ -151,7 +151,7 @@ def test_a_sensor_that_cannot_be_opened_is_a_user_s_error(compose_config, tmp_pa
     def fails(*_):
         raise RuntimeError("input: no camera can be opened: is it plugged in?")
 
-    monkeypatch.setattr("ljn.system.readers.open_recording", fails)
+    monkeypatch.setattr("ljn.tasks.ar.open_recording", fails)
     with pytest.raises(ValueError, match="is it plugged in"):
         ar(config(compose_config, tmp_path, "task.input=live:realsense"))
 
