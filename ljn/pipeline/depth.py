@@ -252,8 +252,9 @@ def _check_size(metres: np.ndarray, area_m2: float, camera: Camera, is_masked: b
             f"depth: what is seen measures {shown}, more than a person; {fix}{', or ' if is_masked else ' '}{causes}?"
         )
     if spans.max() < _SPAN_M[0] or spans.min() < _FLAT_M or area_m2 < AREA_M2[0]:
+        how = "flatter" if spans.min() < _FLAT_M else "less"
         raise ValueError(
-            f"depth: what is seen measures {shown}, less than a person; {causes}, or is the mask wrong?"
+            f"depth: what is seen measures {shown}, {how} than a person; {causes}, or is the mask wrong?"
         )
     if area_m2 < DOUBTFUL_M2[0]:
         report.doubt(
