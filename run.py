@@ -54,5 +54,8 @@ if __name__ == "__main__":
         main()
     except Interruption as interruption:
         if is_first_process():
-            print(f"ended by {interruption.name}: a training is resumed by the same command", file=sys.stderr)
+            print(
+                f"ended by {interruption.name}: a training or a recording is resumed by the same command",
+                file=sys.stderr,
+            )
         raise

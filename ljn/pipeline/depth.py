@@ -20,6 +20,7 @@ DOUBTFUL_M2 = (0.15, 0.85)
 APART_M2 = 0.15
 """A piece of more than this that lies apart from the rest may be somebody else."""
 _SPAN_M = (0.4, 2.9)  # of the longest side: from a crouching child to a tall man who reaches up
+_FLAT_M = 0.03  # nobody is so flat from any side: a strip of a wall, or of a curtain
 _NOISE = 0.4
 """Of neighbouring pixels; of a person's, behind any sensor, less than a quarter jump."""
 _MUCH = 0.2
@@ -250,9 +251,10 @@ def _check_size(metres: np.ndarray, area_m2: float, camera: Camera, is_masked: b
         raise ValueError(
             f"depth: what is seen measures {shown}, more than a person; {fix}{', or ' if is_masked else ' '}{causes}?"
         )
-    if spans.max() < _SPAN_M[0] or area_m2 < AREA_M2[0]:
+    if spans.max() < _SPAN_M[0] or spans.min() < _FLAT_M or area_m2 < AREA_M2[0]:
+        how = "flatter" if spans.min() < _FLAT_M else "less"
         raise ValueError(
-            f"depth: what is seen measures {shown}, less than a person; {causes}, or is the mask wrong?"
+            f"depth: what is seen measures {shown}, {how} than a person; {causes}, or is the mask wrong?"
         )
     if area_m2 < DOUBTFUL_M2[0]:
         report.doubt(

@@ -1,6 +1,6 @@
 """The person's pixels in depth alone, without a curtain."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import cv2
@@ -60,6 +60,7 @@ class DepthOnly:
     Attributes:
         facts: What was found in the last frame: `area_m2`, `place` (metres, camera frame), and without a plate what
             `find_in_scene` says.
+        doubts: Whether it was clear who the person is, where that was not known from the frame before.
     """
 
     def __init__(
@@ -75,8 +76,19 @@ class DepthOnly:
             raise ValueError(f"seed: expected three numbers, metres in the camera frame, got {seed!r}")
         self.plate = _read(plate) if isinstance(plate, str | Path) else plate
         self.facts: dict[str, object] = {}
+        self.doubts: list[str] = []
         self._last = None if seed is None else np.array(seed, float)
         self._last_s = -np.inf if seed is None else np.inf
+
+    @property
+    def state(self) -> dict[str, np.ndarray]:
+        """Where the person was, as arrays by name: to go on from."""
+        return {} if self._last is None else {"place": self._last, "seconds": np.array(self._last_s)}
+
+    @state.setter
+    def state(self, state: Mapping[str, np.ndarray]) -> None:
+        self._last = state.get("place")
+        self._last_s = float(state.get("seconds", -np.inf))
 
     def __call__(self, frame: RgbdFrame, camera: Camera) -> np.ndarray:
         """The person's pixels.
@@ -104,7 +116,7 @@ class DepthOnly:
         seconds = frame.number / _FPS if frame.timestamp_s is None else frame.timestamp_s
         if np.isfinite(self._last_s) and seconds - self._last_s > _FORGOTTEN_S:
             self._last = None
-        self.facts = {}
+        self.facts, self.doubts = {}, []
         found = self._before_plate(depth, camera) if self.plate is not None else self._in_room(depth, camera)
         self._last, self._last_s = _place(found, camera), seconds
         self.facts["place"] = [round(float(value), 3) for value in self._last]
@@ -153,6 +165,8 @@ class DepthOnly:
         misfit = None if scale is None else lambda figure: scale * self._away_m(figure, camera)
         found = find_in_scene(depth, camera, report, misfit).depth
         self.facts |= {name: value for name, value in report.facts.items() if name != "misfit_mm"}
+        if misfit is None:
+            self.doubts = [f"{doubt}, or segmentation.seed" for doubt in report.warnings]
         return found
 
     def _away_m(self, figure: np.ndarray, camera: Camera) -> float:

@@ -2,7 +2,8 @@
 
 A person seen from behind looks much like one seen from the front, and a network that takes one for the other exchanges
 the sides of the whole body. The person in the frame before had the sides where they are now, and a mesh that faces the
-wrong way fits the depth worse.
+wrong way fits the depth worse. The depth is asked where the frame before says otherwise, where there is none, and twice
+a second: sides that stay exchanged while a person turns agree from frame to frame.
 """
 
 from collections.abc import Callable
@@ -18,6 +19,7 @@ from ljn.pipeline.prediction import Prediction
 _BETTER = 0.8  # a fit to the depth that is this much better is clear
 _PATIENCE = 5  # corrections in a row, after which the frames before may be what was wrong
 _MEMORY_S = 0.5  # a person may turn about in a longer gap
+_SURE_S = 0.5  # so long the frames before are trusted without a look at the depth
 _MAX_POINTS = 500  # of the cloud, of which the fit is taken
 
 
@@ -40,6 +42,7 @@ class FlipJudge:
     joints: np.ndarray | None = None  # `(24, 3)` of the frame before, metres, camera frame
     seconds: float = 0.0  # when that was
     num_corrected: int = 0  # in a row
+    compared_s: float = -np.inf  # when both ways round were held against the depth
 
     def __call__(
         self,
@@ -63,12 +66,15 @@ class FlipJudge:
         self, prediction: Prediction, seconds: float, again: Callable[[np.ndarray], Prediction]
     ) -> Judged:
         is_first = self.joints is None or seconds - self.seconds > _MEMORY_S
-        if not is_first and not self._looks_exchanged(prediction.joints):
+        is_exchanged = not is_first and self._looks_exchanged(prediction.joints)
+        if not is_first and not is_exchanged and seconds - self.compared_s <= _SURE_S:
             return Judged(prediction, "")
         other = again(prediction.joints[list(MIRROR)])
         advantage = _misfit(prediction) / max(_misfit(other), 1e-9)  # above 1, the other fits better
-        if is_first:
-            # The other is the same, where the detector has found the way back by itself.
+        self.compared_s = seconds
+        if not is_exchanged:
+            # The frame before says nothing, or was wrong, too. The other is the same, where the detector has found
+            # the way back by itself.
             return Judged(other, "corrected") if advantage > 1 / _BETTER else Judged(prediction, "")
         if self._distance(other.joints) >= self._distance(prediction.joints):
             return Judged(prediction, "unclear")

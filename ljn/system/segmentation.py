@@ -223,18 +223,21 @@ def one_person(metres: np.ndarray, camera: Camera) -> Person:
                 f"{AREA_M2[0]:g}"
             )
         )
-    others = np.where(person.depth > 0, np.float32(0), metres)
-    is_crowd = person.area_m2 > AREA_M2[1]
-    if not is_crowd and person.foreign_m2 > _OTHER_M2:
-        other = find_person(others, camera)
+    if person.area_m2 > AREA_M2[1]:
+        raise ValueError(
+            f"frame.depth: expected one person, what stands before the background measures {person.area_m2:.1f} square "
+            f"metres, more than {AREA_M2[1]:g}: several persons? Or is the depth in another unit (depth_scale in "
+            "camera.yaml), or the camera another one's?"
+        )
+    if person.foreign_m2 > _OTHER_M2:
+        other = find_person(np.where(person.depth > 0, np.float32(0), metres), camera)
         rows = np.flatnonzero(other.depth.any(1))
         z = float(np.median(other.depth[other.depth > 0]))
-        is_crowd = other.area_m2 > _OTHER_M2 and (rows[-1] - rows[0]) * z / camera.fy > _OTHER_M
-    if is_crowd:
-        raise ValueError(
-            "frame.depth: several persons stand before the background, or something of a person's size; expected "
-            "one alone"
-        )
+        if other.area_m2 > _OTHER_M2 and (rows[-1] - rows[0]) * z / camera.fy > _OTHER_M:
+            raise ValueError(
+                "frame.depth: expected one person, several persons stand before the background, or something of a "
+                "person's size; let one alone stand there"
+            )
     return person
 
 

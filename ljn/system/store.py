@@ -1,9 +1,11 @@
 """What the system leaves on disk: a file and a picture for each frame, as soon as it is done, and what is made of all.
 
-A call that is cut off leaves what it has done; the same call goes on after it.
+A call that is cut off leaves what it has done; the same call goes on after it. Of a live sensor numbers may be missing:
+those of frames for which there was no time.
 """
 
 import json
+import logging
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,6 +17,7 @@ from ljn.reading import READ_ERRORS, read_arrays
 from ljn.runs.files import path_part, read_json, write_atomically, write_json
 from ljn.system.system import ArResult
 
+_LOG = logging.getLogger(__name__)
 _SETTINGS = "settings.json"
 _FRAMES, _PICTURES = "frames", "pictures"
 _LEFT_OUT = ("points", "vertices", "faces", "initial_joints")  # large, or made again from the parameters
@@ -54,20 +57,32 @@ class Store:
     Args:
         directory: The directory.
         settings: What the results depend on. What a call with others left there is removed.
+        reads: Whether what a call with the same settings left there is kept.
     """
 
-    def __init__(self, directory: Path, settings: Mapping[str, Any]) -> None:
+    def __init__(self, directory: Path, settings: Mapping[str, Any], reads: bool = True) -> None:
         self.directory = directory
         self.frames, self.pictures = directory / _FRAMES, directory / _PICTURES
         settings = json.loads(json.dumps(settings))  # as it will be read again
-        self.is_resumed = read_json(directory / _SETTINGS) == settings
-        if not self.is_resumed:
-            for folder in (self.frames, self.pictures):
-                for path in folder.glob("*"):
-                    path.unlink()
-        for folder in (directory, self.frames, self.pictures):
+        is_same = reads and read_json(directory / _SETTINGS) == settings
+        if reads and not is_same and (directory / _SETTINGS).is_file():
+            _LOG.info("%s begins anew: settings, weights or the recording's files have changed", directory)
+        self._numbers = self._found() if is_same else []
+        kept = {f"{number:06d}" for number in self._numbers}
+        for folder in (self.frames, self.pictures):
             folder.mkdir(parents=True, exist_ok=True)
-        write_json(directory / _SETTINGS, settings)
+            for path in folder.iterdir():
+                if path.stem.partition("-")[0] not in kept:
+                    path.unlink()
+        if not is_same:
+            write_json(directory / _SETTINGS, settings)
+
+    def _found(self) -> list[int]:
+        """The numbers of the frames that are there, up to the first that is missing."""
+        number = 0
+        while (self.frames / f"{number:06d}.npz").is_file():
+            number += 1
+        return list(range(number))
 
     def write(
         self, result: ArResult, picture: np.ndarray, state: Mapping[str, np.ndarray], about: Mapping[str, Any]
@@ -106,14 +121,12 @@ class Store:
         draft = self.frames / f".{stem}.npz"
         np.savez_compressed(draft, about=np.array(json.dumps(said)), **arrays)  # type: ignore[arg-type]
         draft.replace(self.frames / f"{stem}.npz")  # the last: with it, the frame is done
+        self._numbers.append(result.frame.number)
 
     @property
     def num_done(self) -> int:
-        """How many of the first frames are done, without a gap."""
-        number = 0
-        while (self.frames / f"{number:06d}.npz").is_file():
-            number += 1
-        return number
+        """How many frames are done."""
+        return len(self._numbers)
 
     def read(self, number: int) -> StoredFrame:
         """A frame.
@@ -134,12 +147,8 @@ class Store:
 
     def stored(self) -> Iterator[StoredFrame]:
         """The frames that are done, in order, one at a time."""
-        for number in range(self.num_done):
+        for number in self._numbers:
             yield self.read(number)
-
-    def picture_files(self) -> list[Path]:
-        """The pictures of the frames that are done, in order."""
-        return sorted(self.pictures.glob("*.jpg"))[: self.num_done]
 
     def read_pictures(self, number: int | None = None) -> Iterator[np.ndarray]:
         """The pictures `(H, W, 3)` uint8 of the frames that are done, in order, one at a time.
@@ -149,7 +158,8 @@ class Store:
         """
         import cv2
 
-        paths = self.picture_files()
+        of_number = {path.stem.partition("-")[0]: path for path in self.pictures.glob("*.jpg")}
+        paths = [of_number[f"{done:06d}"] for done in self._numbers]
         if number is not None and len(paths) > number:
             paths = [paths[round(i * (len(paths) - 1) / (number - 1))] for i in range(number)]
         for path in paths:

@@ -1,5 +1,6 @@
 """A recording's summary: numbers, and a page to look at."""
 
+import re
 from collections.abc import Mapping, Sequence
 from html import escape
 from typing import Any
@@ -30,12 +31,14 @@ def summarise(frames: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     Returns:
         `frames`, `predicted`, `failed`, `doubtful`; `flips_corrected`, `flips_unclear`; `frames_per_second` by stage
         and of all together (`all`); means of what frames say of the truth (`iou`, `mpjpe_mm`, `apve_mm`), and
-        `confidence`, the mean of the 2D joints'; `errors`, each with the number of frames that it stopped.
+        `confidence`, the mean of the 2D joints'; `errors`, each with the number of frames that it stopped: those that
+        differ by numbers alone are one, as the first frame said it.
     """
-    errors: dict[str, int] = {}
+    kinds: dict[str, list[str]] = {}
     for frame in frames:
         if frame["error"] is not None:
-            errors[frame["error"]] = errors.get(frame["error"], 0) + 1
+            kinds.setdefault(re.sub(r"\d+(\.\d+)?", "#", frame["error"]), []).append(frame["error"])
+    errors = {told[0]: len(told) for told in kinds.values()}
     seconds = {
         stage: float(np.mean(taken))
         for stage in STAGES
@@ -62,15 +65,16 @@ def summarise(frames: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def page(
-    title: str, summary: Mapping[str, Any], frames: Sequence[Mapping[str, Any]], files: Sequence[str]
+    title: str, summary: Mapping[str, Any], frames: Sequence[Mapping[str, Any]], summary_file: str
 ) -> str:
     """The page: the video, the numbers, what became of the frames that failed or were doubted.
 
     Args:
         title: The recording's name.
-        summary: See `summarise`.
+        summary: See `summarise`; and `recording`, the recording's facts, and `files`, names of what lies beside the
+            page.
         frames: See `summarise`.
-        files: Names of what lies beside the page.
+        summary_file: The name of the summary's file, beside the page.
     """
     shown = {
         "frames": summary["frames"],
@@ -86,10 +90,12 @@ def page(
         for key, unit in units.items()
         if key in summary
     }
-    video = "overlay.mp4" if "overlay.mp4" in files else ""
+    video = next((name for name in summary["files"] if name.endswith(".mp4")), "")
     parts = [facts(shown)]
     if video:
         parts.append(f'<video src="{video}" controls loop muted playsinline style="max-width:100%"></video>')
+    about = {name.replace("_", " "): value for name, value in summary["recording"].items()}
+    parts.append(section("recording", "Recording", facts(about)))
     rates = [
         f'<tr><th scope="row">{escape(stage)}</th>{cell(f"{rate:.1f}")}{cell(f"{1000 / rate:.1f}")}</tr>'
         for stage, rate in summary["frames_per_second"].items()
@@ -105,7 +111,10 @@ def page(
     if told:
         head = [[column("frame", "text"), column("name", "text"), column("what was said", "text")]]
         parts.append(section("frames", "Frames that failed or were doubted", table("frames", head, told)))
-    links = "".join(f'<li><a href="{escape(name, quote=True)}">{escape(name)}</a></li>' for name in files)
+    links = "".join(
+        f'<li><a href="{escape(name, quote=True)}">{escape(name)}</a></li>'
+        for name in (*summary["files"], summary_file)
+    )
     parts.append(section("files", "Files", f"<ul>{links}</ul>"))
     return (
         f'<!doctype html><html lang="en"><head><meta charset="utf-8"><title>{escape(title)}</title>'

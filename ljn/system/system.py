@@ -4,7 +4,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -20,11 +20,25 @@ from ljn.system.flips import FlipJudge
 from ljn.system.recording import RgbdFrame
 from ljn.system.smoothing import PoseSmoother, SmoothingSettings
 
-_FPS = 30.0  # of frames whose times nobody knows
+_FPS = 30.0  # of a recording whose rate nobody knows
 _GAP_S = 0.5  # after a longer one, nothing is smoothed over it
+_JUDGE, _SMOOTHER, _SEGMENTER = "judge_", "smoother_", "segmenter_"  # what is theirs of the state
 
 Segmenter = Callable[[RgbdFrame, Camera], np.ndarray]
 """Finds the person: a frame and its camera in, a mask `(H, W)` bool out; a `ValueError` where there is none."""
+
+
+@runtime_checkable
+class Following(Protocol):
+    """A segmenter that follows the person from frame to frame.
+
+    Attributes:
+        state: What it remembers, as arrays by name, to go on from.
+        doubts: About who it is, in the last frame.
+    """
+
+    state: dict[str, np.ndarray]
+    doubts: list[str]
 
 
 class ArResult(NamedTuple):
@@ -61,6 +75,7 @@ class ArSystem:
             pipeline.
         smoothing: How much is smoothed over time; None: nothing.
         mends_flips: Whether exchanged sides are looked for, and mended.
+        fps: Frames a second, for those whose times nobody knows; None: 30.
     """
 
     def __init__(
@@ -70,13 +85,16 @@ class ArSystem:
         segmenter: Segmenter | None = None,
         smoothing: SmoothingSettings | None = None,
         mends_flips: bool = True,
+        fps: float | None = None,
     ) -> None:
         self.pipeline = pipeline
         self.camera = camera
         self.segmenter = segmenter
         self.smoother = None if smoothing is None else PoseSmoother(smoothing)
         self.judge = FlipJudge() if mends_flips else None
-        self._last_s: float | None = None
+        self.fps = fps or _FPS
+        self._number, self._now_s = 0, 0.0  # of the frame before
+        self._smoothed_s: float | None = None  # when the last one was that was smoothed
 
     def __call__(self, frame: RgbdFrame, keypoints: Any = None) -> ArResult:
         """What is found in a frame; frames come in their order.
@@ -86,13 +104,17 @@ class ArSystem:
             keypoints: 2D keypoints, where somebody gives them; see `body_keypoints`.
         """
         watch, report = _Watch(), Report(is_strict=self.pipeline.is_strict)
-        seconds = frame.number / _FPS if frame.timestamp_s is None else frame.timestamp_s
+        seconds = self._time(frame)
         mask = None
         try:
             if frame.error is not None or frame.depth is None:
                 raise ValueError(frame.error or "it has no depth image")
             with watch("segmentation"):
-                mask = None if self.segmenter is None else self.segmenter(frame, self.camera)
+                if self.segmenter is not None:
+                    mask = self.segmenter(frame._replace(timestamp_s=seconds), self.camera)
+                if isinstance(self.segmenter, Following):
+                    for doubt in self.segmenter.doubts:
+                        report.doubt(doubt)
             with watch("2D joints"):
                 observed = self.pipeline.observe(
                     frame.depth, self.camera, keypoints, mask, report, rgb=frame.rgb
@@ -117,28 +139,38 @@ class ArSystem:
     @property
     def state(self) -> dict[str, np.ndarray]:
         """What it remembers of the frames before, as arrays by name: to go on from."""
-        state = {} if self._last_s is None else {"last_s": np.array(self._last_s)}
+        state = {"number": np.array(self._number), "now_s": np.array(self._now_s)}
+        if self._smoothed_s is not None:
+            state["smoothed_s"] = np.array(self._smoothed_s)
         if self.judge is not None and self.judge.joints is not None:
-            state |= {
-                "judge_joints": self.judge.joints,
-                "judge_seconds": np.array(self.judge.seconds),
-                "judge_corrected": np.array(self.judge.num_corrected),
-            }
+            state |= {f"{_JUDGE}{name}": np.array(value) for name, value in vars(self.judge).items()}
         if self.smoother is not None:
-            state |= {f"smoother_{name}": value for name, value in self.smoother.state.items()}
+            state |= {f"{_SMOOTHER}{name}": value for name, value in self.smoother.state.items()}
+        if isinstance(self.segmenter, Following):
+            state |= {f"{_SEGMENTER}{name}": value for name, value in self.segmenter.state.items()}
         return state
 
     @state.setter
     def state(self, state: Mapping[str, np.ndarray]) -> None:
-        self._last_s = float(state["last_s"]) if "last_s" in state else None
-        if self.judge is not None and "judge_joints" in state:
-            numbers = float(state["judge_seconds"]), int(state["judge_corrected"])
-            self.judge = FlipJudge(state["judge_joints"], *numbers)
-        if self.smoother is not None:
-            start = "smoother_"
-            self.smoother.state = {
-                name.removeprefix(start): value for name, value in state.items() if name.startswith(start)
+        self._number, self._now_s = int(state["number"]), float(state["now_s"])
+        self._smoothed_s = float(state["smoothed_s"]) if "smoothed_s" in state else None
+        if self.judge is not None:
+            values: dict[str, Any] = {
+                name: each if each.ndim else each.item() for name, each in _part(state, _JUDGE).items()
             }
+            self.judge = FlipJudge(**values)
+        if self.smoother is not None:
+            self.smoother.state = _part(state, _SMOOTHER)
+        if isinstance(self.segmenter, Following):
+            self.segmenter.state = _part(state, _SEGMENTER)
+
+    def _time(self, frame: RgbdFrame) -> float:
+        """When a frame was taken, seconds: as it says, or so many frames after the one before."""
+        seconds = frame.timestamp_s
+        if seconds is None:
+            seconds = self._now_s + (frame.number - self._number) / self.fps
+        self._number, self._now_s = frame.number, seconds
+        return seconds
 
     def _from_joints(self, depth: np.ndarray, joints: np.ndarray, report: Report) -> Prediction:
         """The prediction that begins with the image of joints `(24, 3)`, as if it were given as keypoints."""
@@ -150,12 +182,12 @@ class ArSystem:
     @torch.inference_mode()
     def _smoothed(self, prediction: Prediction, seconds: float) -> Prediction:
         """A prediction smoothed over the frames before, its mesh made anew."""
-        last, self._last_s = self._last_s, seconds
         if self.smoother is None:
             return prediction
+        last, self._smoothed_s = self._smoothed_s, seconds
         if last is None or not 0 < seconds - last <= _GAP_S:
             self.smoother.forget()
-            last = seconds - 1 / _FPS
+            last = seconds - 1 / self.fps
         values = {"joints": torch.from_numpy(prediction.joints)}
         if prediction.pose is not None and prediction.mesh_joints is not None:
             rotvecs = torch.from_numpy(prediction.pose).unflatten(-1, (-1, 3))
@@ -172,6 +204,11 @@ class ArSystem:
             meshes = self.pipeline.meshes(*parameters)
             made |= {name: value[0].cpu().numpy() for name, value in meshes.items() if name != "faces"}
         return replace(prediction, **made)
+
+
+def _part(state: Mapping[str, np.ndarray], prefix: str) -> dict[str, np.ndarray]:
+    """The arrays whose names begin with a prefix, without it."""
+    return {name.removeprefix(prefix): value for name, value in state.items() if name.startswith(prefix)}
 
 
 class _Watch:

@@ -4,8 +4,10 @@ import hashlib
 import logging
 import os
 import time
+from collections.abc import Mapping
 from contextlib import nullcontext
 from dataclasses import asdict
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -22,9 +24,11 @@ from ljn.pipeline.motion_glb import write_glb
 from ljn.pipeline.pipeline import Pipeline
 from ljn.refinement import chosen_settings
 from ljn.render import get_renderer
-from ljn.runs.files import path_part, write_json, write_text_atomically
+from ljn.runs.files import path_part, read_json, write_json, write_text_atomically
 from ljn.runs.packages import DEFAULT, shipped
 from ljn.system.overlay import draw_overlay
+from ljn.system.readers import open_recording
+from ljn.system.readers.timestamps import frames_a_second
 from ljn.system.recording import Recording
 from ljn.system.smoothing import SmoothingSettings
 from ljn.system.store import Store
@@ -37,14 +41,11 @@ from ljn.tasks.validation import check_writable
 
 _LOG = logging.getLogger(__name__)
 _FPS = 30.0  # of videos of recordings whose rate nobody knows
-_VIDEO, _SHEET, _MOTION, _SUMMARY, _PAGE = (
-    "overlay.mp4",
-    "overview.jpg",
-    "motion",
-    "summary.json",
-    "index.html",
-)
+_RESULTS = "ar"
+_VIDEO, _SHEET, _SUMMARY, _PAGE = "overlay.mp4", "overview.jpg", "summary.json", "index.html"
+_MOTIONS, _GLB = [f"motion{suffix}" for suffix, _ in WRITERS.values()], "motion.glb"
 _SHOWN, _COLUMNS = 8, 4  # frames of the overview
+_TOLD = 3  # errors that are said at the end
 _COMMAND = "python run.py task=ar input=RECORDING"
 
 
@@ -54,11 +55,12 @@ def ar(cfg: DictConfig) -> dict[str, float]:
     A frame that fails is marked, and the others go on. Each frame leaves its arrays (`frames/`) and a picture
     (`pictures/`); all together leave a video, an overview, the motion in AMASS's form, as BVH and as an animated mesh
     (`.glb`), `summary.json` and a page, `index.html`. A call that is cut off leaves these of the frames that it has
-    done, and the same call goes on.
+    done, and the same call goes on; once all are done, it says so and does nothing. What a live sensor gives goes into
+    a folder of its own each time.
 
     Args:
         cfg: The composed configuration; of it `task`, `recording`, `segmentation`, `ckpt_path`, `weights`, `refine`,
-            `body.path`, `paths`, `num_threads` and `trainer.accelerator` count.
+            `body.path`, `paths`, `num_threads`, `rerun` and `trainer.accelerator` count.
 
     Returns:
         `ar/frames`, `ar/failed`, `ar/frames_per_second`; and where the truth is known `ar/iou` of the silhouettes,
@@ -80,13 +82,13 @@ def ar(cfg: DictConfig) -> dict[str, float]:
         smoothing = SmoothingSettings(**(OmegaConf.to_container(task.smoothing) or {}))  # type: ignore[arg-type]
     if cfg.num_threads is not None:
         torch.set_num_threads(cfg.num_threads)
-    pipeline = _pipeline(cfg, recording)
+    pipeline = _pipeline(cfg)
     segmenter = None if cfg.segmentation is None else build(cfg.segmentation)
-    directory = Path(cfg.paths.output_dir) / "ar" / _name(cfg, recording)
+    directory = Path(cfg.paths.output_dir) / _RESULTS / _name(cfg, recording)
     check_writable(directory)
     stages = (pipeline.detector, pipeline.regressor, pipeline.finder.stage if pipeline.finder else None)
     settings = {
-        "recording": {"name": recording.name, "camera": asdict(recording.camera), **recording.facts},
+        "recording": _identity(cfg, recording),
         "weights": [stage.origin["hash"] for stage in stages if stage is not None],
         "refine": chosen_settings(cfg.refine),
         "segmentation": OmegaConf.to_container(cfg.segmentation, resolve=True) if cfg.segmentation else None,
@@ -95,22 +97,48 @@ def ar(cfg: DictConfig) -> dict[str, float]:
         "true_keypoints": task.true_keypoints,
         "strict": task.strict,
     }
-    store = Store(directory, settings)
-    system = ArSystem(pipeline, recording.camera, segmenter, smoothing, task.mend_flips)
-    try:
-        _run(system, recording, store, task)
-    finally:
-        summary = _finish(store, recording, pipeline, settings)
+    store = Store(directory, settings, reads=not cfg.rerun)
+    summary = _complete(store, _total(recording, task))
+    if summary is not None:
+        _LOG.info("%s is complete; predict it again with rerun=true", directory)
+    else:
+        (directory / _SUMMARY).unlink(missing_ok=True)  # until all is made, nothing is complete
+        system = ArSystem(pipeline, recording.camera, segmenter, smoothing, task.mend_flips, recording.fps)
+        try:
+            _run(system, recording, store, task)
+        finally:
+            summary = _finish(store, recording, pipeline, settings)
+    return _told(summary, directory)
+
+
+def _told(summary: Mapping[str, Any], directory: Path) -> dict[str, float]:
+    """A recording's metrics, once its summary is said.
+
+    Raises:
+        ValueError: No frame could be predicted.
+    """
+    if not summary["frames"]:
+        raise ValueError(
+            f"input: expected frames, got none: {summary['recording'].get('ended', 'it is empty')}"
+        )
+    most = sorted(summary["errors"].items(), key=lambda each: -each[1])[:_TOLD]
+    reasons = "; ".join(f"{count} x {error}" for error, count in most)
     if not summary["predicted"]:
-        reasons = "; ".join(list(summary["errors"])[:3])
-        raise ValueError(f"input: none of {summary['frames']} frames could be predicted: {reasons}")
+        raise ValueError(
+            f"input: none of {summary['frames']} frames could be predicted: {reasons} ({directory / _PAGE})"
+        )
+    doubted = f", {summary['doubtful']} doubted" if summary["doubtful"] else ""
+    _LOG.info(
+        "%d of %d frames predicted%s: %s", summary["predicted"], summary["frames"], doubted, directory / _PAGE
+    )
+    if reasons:
+        _LOG.warning("%d frames failed: %s", summary["failed"], reasons)
     metrics: dict[str, float] = {
         name: float(summary[name])
         for name in ("frames", "failed", "iou", "mpjpe_mm", "apve_mm")
         if name in summary
     }
     metrics["frames_per_second"] = summary["frames_per_second"]["all"]
-    _LOG.info("%d of %d frames predicted: %s", summary["predicted"], summary["frames"], directory / _PAGE)
     return {f"ar/{name}": value for name, value in metrics.items()}
 
 
@@ -124,12 +152,13 @@ def _recording(cfg: DictConfig) -> Any:
         )
     if given is None:
         return build(cfg.recording)
-    from ljn.system.readers import open_recording
+    try:
+        return open_recording(given, cfg.task.camera, cfg.task.rgb_camera)
+    except RuntimeError as error:  # a sensor that cannot be opened
+        raise ValueError(str(error)) from error
 
-    return open_recording(given, cfg.task.camera, cfg.task.rgb_camera)
 
-
-def _pipeline(cfg: DictConfig, recording: Recording) -> Pipeline:
+def _pipeline(cfg: DictConfig) -> Pipeline:
     """The pipeline of the weights that a call names, or of those that ship."""
     task = cfg.task
     if cfg.weights is None and cfg.ckpt_path is None and DEFAULT in shipped():
@@ -148,23 +177,55 @@ def _pipeline(cfg: DictConfig, recording: Recording) -> Pipeline:
 
 def _name(cfg: DictConfig, recording: Recording) -> str:
     """The folder of a recording: one that no other has."""
-    if cfg.task.input is None or str(cfg.task.input).startswith("live:"):
+    if cfg.task.input is None:
         return path_part(recording.name)
+    if str(cfg.task.input).startswith("live:"):  # what is there now does not come again
+        return f"{path_part(recording.name)}-{datetime.now():%Y%m%d-%H%M%S}"
     path = Path(cfg.task.input).resolve()
     return f"{path_part(path.name)}-{hashlib.sha256(os.fsencode(path)).hexdigest()[:6]}"
 
 
+def _identity(cfg: DictConfig, recording: Recording) -> dict[str, Any]:
+    """What a recording is: what it is rendered from, or its files, by their names, sizes and times of change."""
+    identity: dict[str, Any] = {"name": recording.name, "camera": asdict(recording.camera)}
+    if cfg.recording is not None:
+        return {**identity, "rendered": OmegaConf.to_container(cfg.recording, resolve=True)}
+    given = [cfg.task.input, cfg.task.camera, cfg.task.rgb_camera]
+    if cfg.segmentation is not None:
+        given.append(cfg.segmentation.get("plate"))
+    results, digest = (Path(cfg.paths.output_dir) / _RESULTS).resolve(), hashlib.sha256()
+    for root in (Path(each).resolve() for each in given if each is not None):
+        for path in [root, *sorted(root.rglob("*"))]:
+            if path.is_file() and not path.is_relative_to(results):
+                stat = path.stat()
+                digest.update(os.fsencode(path) + f" {stat.st_size} {stat.st_mtime_ns}\n".encode())
+    return {**identity, "files": digest.hexdigest()[:16]}
+
+
+def _total(recording: Recording, task: DictConfig) -> int | None:
+    """How many frames are asked for; None: as many as come."""
+    known = [number for number in (recording.num_frames, task.max_frames) if number is not None]
+    return min(known, default=None)
+
+
+def _complete(store: Store, total: int | None) -> dict[str, Any] | None:
+    """The summary of what is complete; None where frames are to be predicted, or files of them to be made."""
+    summary = read_json(store.directory / _SUMMARY)
+    if not store.num_done or summary is None or summary["frames"] != store.num_done:
+        return None
+    is_over = "ended" in summary["recording"] or (total is not None and store.num_done >= total)
+    has_all = all((store.directory / name).is_file() for name in summary["files"])
+    return summary if is_over and has_all else None
+
+
 def _run(system: ArSystem, recording: Any, store: Store, task: DictConfig) -> None:
     """Predict and write frame by frame, from the first that is not done."""
-    done = store.num_done
+    done, total = store.num_done, _total(recording, task)
+    if total is not None and done >= total:
+        return
     if done:
         _LOG.info("going on after %d frames that are done: %s", done, store.directory)
         system.state = store.read(done - 1).state
-    total = recording.num_frames
-    if task.max_frames is not None:
-        total = task.max_frames if total is None else min(total, task.max_frames)
-    if total is not None and done >= total:
-        return
     has_truth = hasattr(recording, "truth")
     begin = time.perf_counter()
     with (
@@ -229,20 +290,27 @@ def _finish(
         prediction = frame.prediction
         has_mesh = prediction is not None and prediction.pose is not None
         posed.append(PosedFrame.of(prediction) if prediction is not None and has_mesh else None)
-    summary = summarise(frames)
-    fps = recording.fps or _FPS
-    write_video(store.directory / _VIDEO, store.read_pictures(), fps)
-    if pictures := list(store.read_pictures(_SHOWN)):
-        Image.fromarray(contact_sheet(pictures, _COLUMNS)).save(store.directory / _SHEET, quality=90)
+    # What could not be read is among the errors, that of earlier calls, too.
+    about = {name: value for name, value in recording.facts.items() if name != "unreadable"}
+    summary = {"recording": about, **summarise(frames)}
+    # Of a live sensor, as fast as frames were taken from it.
+    fps = frames_a_second([frame["timestamp_s"] for frame in frames]) or recording.fps or _FPS
+    files = []
+    if write_video(store.directory / _VIDEO, store.read_pictures(), fps):
+        Image.fromarray(contact_sheet(list(store.read_pictures(_SHOWN)), _COLUMNS)).save(
+            store.directory / _SHEET, quality=90
+        )
+        files = [_VIDEO, _SHEET]
     if pipeline.regressor is not None and any(frame is not None for frame in posed):
         motion = body_motion(posed, pipeline.regressor.module.body, fps)
-        for suffix, write in WRITERS.values():
-            write(store.directory / f"{_MOTION}{suffix}", motion)
-        write_glb(store.directory / f"{_MOTION}.glb", motion, pipeline.regressor.module.body)
+        for name, (_, write) in zip(_MOTIONS, WRITERS.values()):
+            write(store.directory / name, motion)
+        write_glb(store.directory / _GLB, motion, pipeline.regressor.module.body)
+        files += [*_MOTIONS, _GLB]
+    for name in {_VIDEO, _SHEET, *_MOTIONS, _GLB} - set(files):  # of other settings
+        (store.directory / name).unlink(missing_ok=True)
+    summary["files"] = files
+    write_text_atomically(store.directory / _PAGE, page(recording.name, summary, frames, _SUMMARY))
+    # The last: with it, all is complete.
     write_json(store.directory / _SUMMARY, {**summary, "settings": settings, "per_frame": frames})
-    motions = [f"{_MOTION}{suffix}" for suffix, _ in WRITERS.values()]
-    made = [_VIDEO, _SHEET, *motions, f"{_MOTION}.glb", _SUMMARY]
-    files = [name for name in made if (store.directory / name).is_file()]
-    if frames:
-        write_text_atomically(store.directory / _PAGE, page(recording.name, summary, frames, files))
     return summary

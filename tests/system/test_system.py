@@ -9,11 +9,13 @@ from ljn.demo import FRAMES
 from ljn.pipeline.pipeline import Pipeline
 from ljn.pipeline.prediction import Prediction
 from ljn.pipeline.samples import find_samples
+from ljn.system.depth_only import DepthOnly, background_plate
 from ljn.system.flips import FlipJudge
 from ljn.system.overlay import draw_overlay
 from ljn.system.recording import RgbdFrame
 from ljn.system.smoothing import SmoothingSettings
 from ljn.system.system import ArSystem
+from tests.system.test_segmentation import CAMERA, room
 
 
 @pytest.fixture(scope="module")
@@ -128,9 +130,54 @@ def test_sides_of_the_first_frame_are_judged_by_the_depth(shipped, frame):
     assert FlipJudge()(right, 0.0, lambda _: wrong).prediction is right
 
 
+def test_sides_that_were_wrong_for_long_are_found_by_the_depth(shipped, frame):
+    depth, camera = frame
+    right = shipped(depth, camera)
+    wrong = replace(right, joints=right.joints[list(MIRROR)], vertices=right.vertices + 0.1)
+    judge = FlipJudge(joints=wrong.joints, seconds=0.0, compared_s=0.0)
+    flips = [judge(wrong, 0.2 * i, lambda _: right).flip for i in range(1, 6)]
+    assert flips == ["", "", "corrected", "corrected", "corrected"]
+    judge = FlipJudge(joints=right.joints, seconds=0.0, compared_s=0.0)
+    assert [judge(right, 0.2 * i, lambda _: wrong).flip for i in range(1, 6)] == [""] * 5
+
+
 def test_a_pipeline_without_a_mesh_has_joints_alone(shipped, frame):
     depth, camera = frame
     system = ArSystem(Pipeline(shipped.detector), camera, smoothing=SmoothingSettings())
     result = [system(each) for each in sequence(depth, 2)][-1]
     assert result.error is None
     assert result.prediction.vertices is None
+
+
+def test_a_state_holds_where_the_person_was(shipped):
+    plate = background_plate(room(seed, people=())[0] for seed in range(5))
+    alone, crowd = room(9)[0], room(10, people=(-0.3, 0.9))[0]._replace(number=1, timestamp_s=0.03)
+    whole = ArSystem(shipped, CAMERA, DepthOnly(plate))
+    whole(alone)
+    state = whole.state
+    expected = whole(crowd)
+    assert expected.error is None
+    resumed = ArSystem(shipped, CAMERA, DepthOnly(plate))
+    resumed.state = state
+    np.testing.assert_array_equal(resumed(crowd).mask, expected.mask)
+    # One that has forgotten the seed has no state that brings it back.
+    seeded = ArSystem(shipped, CAMERA, DepthOnly(plate, seed=(1.0, 0.0, 2.0)))
+    seeded.state = ArSystem(shipped, CAMERA, DepthOnly(plate)).state
+    assert "several persons" in seeded(crowd).error
+
+
+def test_a_frame_without_a_time_comes_after_the_one_before(shipped, frame):
+    depth, camera = frame
+    seen = []
+
+    def segmenter(frame, camera):
+        seen.append(frame.timestamp_s)
+        return frame.depth > 0
+
+    system = ArSystem(shipped, camera, segmenter, fps=10)
+    for number, seconds in enumerate([None, 7.0, None, None, 7.4]):
+        system(RgbdFrame(number, "a", depth, timestamp_s=seconds))
+        if number == 2:  # as if it went on in another process
+            state, system = system.state, ArSystem(shipped, camera, segmenter, fps=10)
+            system.state = state
+    np.testing.assert_allclose(seen, [0, 7.0, 7.1, 7.2, 7.4])

@@ -99,6 +99,47 @@ def test_a_call_that_was_cut_off_leaves_a_video_and_the_same_call_goes_on(
     assert recording.asked == [0, 1]
 
 
+def test_what_is_complete_is_not_made_again(recording, compose_config, tmp_path, monkeypatch, caplog):
+    cfg = config(compose_config, tmp_path, "task.max_frames=2")
+    first = ar(cfg)
+    directory = tmp_path / "ar" / "held"
+    before = {path: path.stat().st_mtime_ns for path in directory.rglob("*") if path.is_file()}
+    recording.asked = []
+    with caplog.at_level("INFO"):
+        assert ar(cfg) == first
+    assert recording.asked == []
+    assert f"{directory} is complete; predict it again with rerun=true" in caplog.text
+    assert {path: path.stat().st_mtime_ns for path in before} == before
+    # What somebody has removed is made again, of the frames that are there.
+    (directory / "motion.bvh").unlink()
+    ar(cfg)
+    assert (directory / "motion.bvh").is_file()
+    assert recording.asked == []
+    ar(config(compose_config, tmp_path, "task.max_frames=2", "rerun=true"))
+    assert recording.asked == [0, 1]
+    recording.asked = []
+    assert ar(config(compose_config, tmp_path))["ar/frames"] == 5
+    assert recording.asked == [2, 3, 4]
+    assert video_length(directory / "overlay.mp4") == 5
+
+
+def test_nothing_of_other_settings_is_left(recording, compose_config, tmp_path):
+    ar(config(compose_config, tmp_path))
+    recording.depth = recording.depth * 0
+    with pytest.raises(ValueError, match="none of 5 frames"):
+        ar(config(compose_config, tmp_path, "task.smooth=true"))
+    left = {path.name for path in (tmp_path / "ar" / "held").iterdir()}
+    assert left == {
+        "frames",
+        "pictures",
+        "settings.json",
+        "overlay.mp4",
+        "overview.jpg",
+        "summary.json",
+        "index.html",
+    }
+
+
 def test_what_cannot_be_is_named(compose_config, tmp_path):
     with pytest.raises(
         ValueError, match=r"input, recording: expected one of them, got neither; python run.py task=ar"
@@ -106,9 +147,18 @@ def test_what_cannot_be_is_named(compose_config, tmp_path):
         ar(config(compose_config, tmp_path))
 
 
+def test_a_sensor_that_cannot_be_opened_is_a_user_s_error(compose_config, tmp_path, monkeypatch):
+    def fails(*_):
+        raise RuntimeError("input: no camera can be opened: is it plugged in?")
+
+    monkeypatch.setattr("ljn.tasks.ar.open_recording", fails)
+    with pytest.raises(ValueError, match="is it plugged in"):
+        ar(config(compose_config, tmp_path, "task.input=live:realsense"))
+
+
 def test_a_recording_without_a_person_is_an_error_that_says_why(recording, compose_config, tmp_path):
     recording.depth = recording.depth * 0
-    with pytest.raises(ValueError, match=r"none of 5 frames could be predicted: depth: all pixels are 0"):
+    with pytest.raises(ValueError, match=r"none of 5 frames could be predicted: 4 x depth: all pixels are 0"):
         ar(config(compose_config, tmp_path))
 
 

@@ -308,7 +308,7 @@ def test_sigterm_and_ctrl_c_are_said_and_recorded_and_the_run_goes_on(tmp_path):
         process.send_signal(number)
         output = process.communicate(timeout=60)[0]
         assert process.returncode == returncode
-        assert f"ended by {number.name}: a training is resumed by the same command" in output
+        assert f"ended by {number.name}: a training or a recording is resumed by the same command" in output
         assert "Traceback" not in output
         [record] = tmp_path.glob("runs/*/record.json")
         assert json.loads(record.read_text())["status"] == "interrupted"

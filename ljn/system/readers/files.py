@@ -22,7 +22,7 @@ MILLIMETRES = 1000.0
 CameraLike = str | Path | Camera | LensCamera
 _INVALID = 65000  # codes of sensors for "nothing measured", from here on
 _FARTHEST_M = 20.0
-_NEAREST_M = 0.1
+_NEAREST_M = 0.4  # of half of an image: nobody is seen whole from there
 _PROBES = 8
 _CAMERA_NAMES = ("camera.yaml", "camera.yml", "camera.json", "camera_intrinsic.json", "intrinsic.json")
 _RGB_CAMERA_NAMES = ("rgb_camera.yaml", "rgb_camera.yml", "rgb_camera.json")
@@ -232,26 +232,20 @@ class FileRecording:
 
     def _read(self, number: int, video: Video | None) -> RgbdFrame:
         entry = self._entries[number]
-        depth = rgb = None
-        errors = []
+        depth = rgb = error = None
         try:
             depth = self._depth(entry)
-        except (ValueError, FileNotFoundError) as error:
-            errors.append(str(error))
-        try:
             rgb = self._rgb(entry, video)
-        except (ValueError, FileNotFoundError) as error:
-            errors.append(str(error))
+        except (ValueError, FileNotFoundError) as caught:
+            error = str(caught)
         if depth is not None:
             depth, rgb = self._align(depth, rgb)
-        else:
-            rgb = None  # registered to nothing
-        return RgbdFrame(number, entry.name, depth, rgb, self._times[number], "; ".join(errors) or None)
+        return RgbdFrame(number, entry.name, depth, rgb, self._times[number], error)
 
     def _depth(self, entry: Entry) -> np.ndarray:
         """`(H, W)` float32, metres."""
         if entry.depth is None:
-            raise ValueError(f"depth: no depth image of the frame '{entry.name}'")
+            raise ValueError(f"depth: no depth image of the frame '{entry.name}', although others have one")
         depth = metres(read_depth(entry.depth), self._cameras.depth_scale)
         size = (self.camera.height, self.camera.width)
         if depth.shape != size:
@@ -266,7 +260,7 @@ class FileRecording:
         if not self._has_colours:
             return None
         if entry.rgb is None:
-            raise ValueError(f"rgb: no colour image of the frame '{entry.name}'")
+            raise ValueError(f"rgb: no colour image of the frame '{entry.name}', although others have one")
         if isinstance(entry.rgb, int):
             assert video is not None
             rgb = video.read(entry.rgb)
@@ -353,7 +347,7 @@ def _is_plausible(path: Path, depth_scale: float) -> bool:
         return True
     raise ValueError(
         f"depth: half of '{path}' is nearer than {median:g} m: another unit? Integers are millimetres unless "
-        "depth_scale says how many are a metre (5000 in TUM's files), floats metres"
+        "depth_scale in camera.yaml says how many are a metre (5000 in TUM's files), floats metres"
     )
 
 
