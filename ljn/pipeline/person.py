@@ -17,9 +17,9 @@ APART_M = 0.2
 """No gap is so wide between the parts of a person whom nothing hides."""
 RIM_M, THIN_M, LONG_M, BESIDE = 0.25, 0.12, 1.0, 0.45
 """A rim of the background, left by a mask too wide: pieces behind what is beside them, nowhere thicker than the second,
-together longer than the third; and each by itself as long, or farther than the first from the person. Of their outline
-more than the last is beside other pieces, as half of a rim's is: a limb, which is long and thin, too, begins at some of
-them and reaches out into nothing."""
+together longer than the third, and each by itself half as long or farther than the first from the person. Of their
+outline more than the last is beside other pieces, as half of a rim's is: a limb, which is long and thin, too, is beside
+them only where it begins."""
 SPECK_M2, STRAY_M = 0.0005, 0.2
 """A piece smaller than the first and farther than the second from the person is a flying pixel.
 
@@ -126,7 +126,7 @@ def find_person(metres: np.ndarray, camera: Camera, near_m: float = NEAR_M) -> P
         nearest = tree.query(points[rows])[0]
         starts = np.cumsum([0, *(len(samples[i]) for i in others[:-1])])
         distance[others] = np.minimum(distance[others], np.minimum.reduceat(nearest, starts))
-        is_rim = ~is_person & is_like_rim & ((distance > RIM_M) | (length_m > LONG_M))
+        is_rim = ~is_person & is_like_rim & ((distance > RIM_M) | (length_m > LONG_M / 2))
         is_rim &= length_m[is_rim].sum() > LONG_M
         is_flying = (pieces.area_m2 < SPECK_M2) & (distance > STRAY_M)
         joins = ~is_person & (distance < near_m) & ~is_rim & ~is_flying
