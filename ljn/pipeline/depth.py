@@ -1,11 +1,12 @@
 """Depth images and masks as sensors and files give them, checked and turned into the person's own depth."""
 
+import math
 from typing import Any
 
 import numpy as np
 
 from ljn.geometry.camera import Camera
-from ljn.pipeline.person import find_person, jumps_share
+from ljn.pipeline.person import Person, find_person, jumps_share
 from ljn.pipeline.report import Report
 from ljn.pipeline.scene import Misfit, find_in_scene
 
@@ -15,8 +16,14 @@ _INVALID_MM = 65000  # codes of sensors for "nothing measured", from here on
 AREA_M2 = (0.07, 1.0)
 """Seen across the line of sight, a person has some 0.17 to 0.7 square metres, in any pose, dressed or not; what has
 less than the first or more than the second is none. `python -m tests.benchmarks.input_checks` measures it."""
-DOUBTFUL_M2 = (0.15, 0.85)
-"""Outside of these it may be one: a child, somebody half hidden, or two people."""
+DOUBTFUL_M2 = 0.85
+"""What has more may be one person, or two."""
+REACH_M = 0.7
+"""The root of the mean square of the distances of a person's points from their middle is at most this, with the arms
+stretched up; what reaches farther may be two people."""
+DOUBTFUL_M3 = 0.046
+"""Area times reach: what has less may be a child, or somebody half hidden. The area alone would doubt who lies with the
+feet towards the camera, of whom little is seen, but far."""
 APART_M2 = 0.15
 """A piece of more than this that lies apart from the rest may be somebody else."""
 _SPAN_M = (0.4, 2.9)  # of the longest side: from a crouching child to a tall man who reaches up
@@ -91,12 +98,7 @@ def body_depth(
         },
     )
     num_dropped = 0 if is_scene else person.num_foreign + person.num_rim + person.num_flying
-    _check_size(person.depth, person.area_m2, camera, mask is not None, report)
-    if person.apart_m2 > APART_M2:
-        report.doubt(
-            f"depth: a piece of {person.apart_m2:.2f} square metres lies apart from the rest: somebody else? Give a "
-            "mask of the person alone"
-        )
+    _check_size(person, camera, mask is not None, report)
     if num_dropped > _MUCH * num_pixels:
         report.doubt(
             f"depth: {num_dropped} pixels beside the person's {num_pixels} were dropped, {person.num_foreign} of them "
@@ -232,10 +234,11 @@ def _metres(depth: np.ndarray, is_inside: np.ndarray | None, report: Report) -> 
     return metres / np.float32(1000) if is_integer else metres
 
 
-def _check_size(metres: np.ndarray, area_m2: float, camera: Camera, is_masked: bool, report: Report) -> None:
-    """Refuse what has not the size of a person; `metres` `(H, W)` is not empty."""
-    v, u = np.nonzero(metres)
-    z = metres[v, u].astype(np.float64)
+def _check_size(person: Person, camera: Camera, is_masked: bool, report: Report) -> None:
+    """Refuse what has not the size of a person."""
+    area_m2 = person.area_m2
+    v, u = np.nonzero(person.depth)
+    z = person.depth[v, u].astype(np.float64)
     points = np.stack([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z], -1)
     low, high = np.percentile(points, [2, 98], axis=0)  # stray pixels should not decide
     spans = high - low
@@ -256,12 +259,24 @@ def _check_size(metres: np.ndarray, area_m2: float, camera: Camera, is_masked: b
         raise ValueError(
             f"depth: what is seen measures {shown}, {how} than a person; {causes}, or is the mask wrong?"
         )
-    if area_m2 < DOUBTFUL_M2[0]:
+    weight = z**2  # a pixel's area grows with it
+    middle = weight @ points / weight.sum()
+    reach_m = math.sqrt(weight @ np.square(points - middle).sum(-1) / weight.sum())
+    if area_m2 * reach_m < DOUBTFUL_M3:
         report.doubt(
             f"depth: what is seen measures {shown}, little for a person: a child, somebody half hidden, or {causes}?"
         )
-    if area_m2 > DOUBTFUL_M2[1]:
+    is_large = area_m2 > DOUBTFUL_M2 or reach_m > REACH_M
+    apart = f"a piece of {person.apart_m2:.2f} square metres lies apart from the rest"
+    if is_large and person.apart_m2 > APART_M2:
+        raise ValueError(
+            f"depth: what is seen measures {shown}, much for a person, and {apart}: there are two, or background is in "
+            "it; give a mask of the person alone"
+        )
+    if is_large:
         report.doubt(
             f"depth: what is seen measures {shown}, much for a person: are there two, or is background in it? Give a "
             "mask of the person alone"
         )
+    if person.apart_m2 > APART_M2:
+        report.doubt(f"depth: {apart}: somebody else? Give a mask of the person alone")

@@ -15,9 +15,11 @@ NEAR_M = 0.8
 """A piece this near to the person belongs to it: a limb before or behind the trunk."""
 APART_M = 0.2
 """No gap is so wide between the parts of a person whom nothing hides."""
-RIM_M, THIN_M, LONG_M = 0.25, 0.12, 1.0
-"""A rim of the background, left by a mask too wide: pieces behind what is beside them, farther than the first from the
-person, nowhere thicker than the second, and together longer than the third."""
+RIM_M, THIN_M, LONG_M, BESIDE = 0.25, 0.12, 1.0, 0.45
+"""A rim of the background, left by a mask too wide: pieces behind what is beside them, nowhere thicker than the second,
+together longer than the third, and each by itself half as long or farther than the first from the person. Of their
+outline more than the last is beside other pieces, as half of a rim's is: a limb, which is long and thin, too, is beside
+them only where it begins."""
 SPECK_M2, STRAY_M = 0.0005, 0.2
 """A piece smaller than the first and farther than the second from the person is a flying pixel.
 
@@ -34,6 +36,7 @@ class Pieces(NamedTuple):
         pixels: `(P,)`, number of pixels.
         thickness_m: `(P,)`, the greatest thickness in the image, at its depth.
         is_behind: `(P,)`, share of the pixels at its rim, beside other pieces, that are behind those.
+        is_beside: `(P,)`, share of its rim that is beside other pieces, and not beside nothing.
     """
 
     labels: np.ndarray
@@ -41,13 +44,14 @@ class Pieces(NamedTuple):
     pixels: np.ndarray
     thickness_m: np.ndarray
     is_behind: np.ndarray
+    is_beside: np.ndarray
 
 
 def pieces_of(metres: np.ndarray, camera: Camera) -> Pieces:
     """The pieces of a depth image `(H, W)` float32, metres; 0 is nothing."""
     labels, number = _label(metres, JUMP_M, JUMP_SHARE)
-    pixels, z, area, thickness, behind = _measure(metres, labels, number)
-    return Pieces(labels, area / (camera.fx * camera.fy), pixels, thickness * z / pixels / camera.fx, behind)
+    pixels, z, area, thickness, *shares = _measure(metres, labels, number)
+    return Pieces(labels, area / (camera.fx * camera.fy), pixels, thickness * z / pixels / camera.fx, *shares)
 
 
 def jumps_share(metres: np.ndarray) -> float:
@@ -109,6 +113,8 @@ def find_person(metres: np.ndarray, camera: Camera, near_m: float = NEAR_M) -> P
     is_person[first] = True
     distance = np.full(number, np.inf)
     is_rim, is_flying = np.zeros(number, bool), np.zeros(number, bool)
+    is_like_rim = (pieces.thickness_m < THIN_M) & (pieces.is_behind > 0.5) & (pieces.is_beside > BESIDE)
+    length_m = pieces.area_m2 / pieces.thickness_m
     fresh = [first]
     while fresh:
         chosen = np.concatenate([order[ends[i] - pieces.pixels[i] : ends[i]] for i in fresh])
@@ -120,8 +126,8 @@ def find_person(metres: np.ndarray, camera: Camera, near_m: float = NEAR_M) -> P
         nearest = tree.query(points[rows])[0]
         starts = np.cumsum([0, *(len(samples[i]) for i in others[:-1])])
         distance[others] = np.minimum(distance[others], np.minimum.reduceat(nearest, starts))
-        is_rim = ~is_person & (pieces.thickness_m < THIN_M) & (pieces.is_behind > 0.5) & (distance > RIM_M)
-        is_rim &= (pieces.area_m2 / pieces.thickness_m)[is_rim].sum() > LONG_M
+        is_rim = ~is_person & is_like_rim & ((distance > RIM_M) | (length_m > LONG_M / 2))
+        is_rim &= length_m[is_rim].sum() > LONG_M
         is_flying = (pieces.area_m2 < SPECK_M2) & (distance > STRAY_M)
         joins = ~is_person & (distance < near_m) & ~is_rim & ~is_flying
         fresh = np.flatnonzero(joins).tolist()
@@ -196,11 +202,11 @@ def _label(metres: np.ndarray, jump: float, share: float) -> tuple[np.ndarray, i
 @numba.njit(cache=True, nogil=True)
 def _measure(
     metres: np.ndarray, labels: np.ndarray, number: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Of each piece: pixels, sums of depth and of its square, thickness in pixels, share of the rim that is behind."""
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Of each piece: pixels, sums of depth and of its square, thickness in pixels, shares: see `Pieces`."""
     height, width = metres.shape
     pixels, z_sum, area = np.zeros(number, np.int64), np.zeros(number), np.zeros(number)
-    thickness, rim, behind = np.zeros(number), np.zeros(number), np.zeros(number)
+    thickness, rim, behind, bare = np.zeros(number), np.zeros(number), np.zeros(number), np.zeros(number)
     # Steps to the nearest pixel of another piece or of nothing, by two passes over the eight neighbours.
     inside = np.zeros((height + 2, width + 2), np.int32)
     for v in range(height):
@@ -215,8 +221,11 @@ def _measure(
             nearest = 1 << 20
             for dv, du in ((0, -1), (-1, -1), (-1, 0), (-1, 1)):
                 row, column = v + dv, u + du
-                is_same = row >= 0 and 0 <= column < width and labels[row, column] == label
+                is_seen = row >= 0 and 0 <= column < width
+                is_same = is_seen and labels[row, column] == label
                 nearest = min(nearest, inside[row + 1, column + 1] if is_same else 0)
+                if is_seen and labels[row, column] < 0:
+                    bare[label] += 1
             inside[v + 1, u + 1] = nearest + 1
     for v in range(height - 1, -1, -1):
         for u in range(width - 1, -1, -1):
@@ -226,9 +235,12 @@ def _measure(
             nearest = inside[v + 1, u + 1] - 1
             for dv, du in ((0, 1), (1, -1), (1, 0), (1, 1)):
                 row, column = v + dv, u + du
-                is_same = row < height and 0 <= column < width and labels[row, column] == label
+                is_seen = row < height and 0 <= column < width
+                is_same = is_seen and labels[row, column] == label
                 nearest = min(nearest, inside[row + 1, column + 1] if is_same else 0)
-                if not is_same and row < height and 0 <= column < width and labels[row, column] >= 0:
+                if is_seen and labels[row, column] < 0:
+                    bare[label] += 1
+                elif is_seen and not is_same:
                     other = labels[row, column]
                     rim[label] += 1
                     rim[other] += 1
@@ -241,4 +253,5 @@ def _measure(
     for label in range(number):
         if rim[label] > 0:
             behind[label] /= rim[label]
-    return pixels, z_sum, area, thickness, behind
+            rim[label] /= rim[label] + bare[label]
+    return pixels, z_sum, area, thickness, behind, rim

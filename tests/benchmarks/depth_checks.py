@@ -60,6 +60,7 @@ def _swapped(sample: Sample) -> Given:
 
 
 MUTATIONS: dict[str, Callable[[Sample, np.random.Generator], Given]] = {
+    "mask 4 px too wide, wall 0.1 m behind": lambda sample, _: _widened(sample, 4, 0.1),
     "mask 1 px too wide, wall 0.4 m behind": lambda sample, _: _widened(sample, 1, 0.4),
     "mask 2 px too wide, wall 1.6 m behind": lambda sample, _: _widened(sample, 2, 1.6),
     "mask 4 px too wide, wall 1.6 m behind": lambda sample, _: _widened(sample, 4, 1.6),

@@ -9,7 +9,7 @@ from ljn.body import SMPL
 from ljn.body.skeleton import JOINT_INDEX, ROOT
 from ljn.geometry.camera import Camera
 from ljn.pipeline.depth import body_depth, person_mask
-from ljn.pipeline.person import pieces_of
+from ljn.pipeline.person import find_person, pieces_of
 from ljn.pipeline.report import Report
 from ljn.render import get_renderer
 
@@ -43,8 +43,21 @@ def test_pieces_are_those_of_a_slow_search():
             assert pieces.pixels[found[0]] == np.count_nonzero(labels == label)
             z = 1.0 + 0.5 * step
             assert pieces.area_m2[found[0]] == pytest.approx(pieces.pixels[found[0]] * z * z / 3000)
+            beside = [steps[place] for place in _around(labels == label)]
+            others = np.count_nonzero(beside)
+            assert pieces.is_beside[found[0]] == pytest.approx(others / len(beside) if others else 0)
     assert number == len(pieces.pixels)
     assert (pieces.labels[metres == 0] == -1).all()
+
+
+def _around(is_piece):
+    """The pixels beside each pixel of a piece that are not of it, one for each pair of eight neighbours."""
+    height, width = is_piece.shape
+    for v, u in zip(*np.nonzero(is_piece)):
+        for row in range(max(0, v - 1), min(height, v + 2)):
+            for column in range(max(0, u - 1), min(width, u + 2)):
+                if not is_piece[row, column]:
+                    yield row, column
 
 
 def test_an_image_of_noise_has_a_piece_for_each_pixel_and_is_refused():
@@ -63,7 +76,7 @@ def test_thickness_is_that_of_the_largest_square_inside():
     assert sorted(pieces.thickness_m) == pytest.approx([1 * 2 / 100, 7 * 2 / 100])
 
 
-@pytest.mark.parametrize("gap_m", [0.25, 0.4, 1.6, 4.0])
+@pytest.mark.parametrize("gap_m", [0.15, 0.25, 0.4, 1.6, 4.0])
 @pytest.mark.parametrize("wide_px", [1, 2, 4])
 def test_a_mask_too_wide_adds_no_background(gap_m, wide_px, person):
     body = person > 0
@@ -75,6 +88,16 @@ def test_a_mask_too_wide_adds_no_background(gap_m, wide_px, person):
     np.testing.assert_array_equal(found[body], person[body])
     dropped = report.facts["dropped"]
     assert sum(dropped.values()) >= 0.98 * np.count_nonzero(mask & ~body)
+
+
+def test_limbs_behind_the_body_are_no_rim():
+    camera, metres = Camera(200.0, 200.0, 100.0, 100.0, 200, 200), np.zeros((200, 200), np.float32)
+    for left in (70, 122):  # thin, behind, and together 1.3 m long: but beside the body only where they begin
+        metres[100:170, left : left + 8] = 2.4
+    metres[30:110, 70:130] = 2.0
+    found = find_person(metres, camera)
+    np.testing.assert_array_equal(found.depth, metres)
+    assert found.num_rim == 0
 
 
 @pytest.mark.parametrize("share", [0.001, 0.005, 0.03])
@@ -142,12 +165,45 @@ def test_a_principal_point_is_that_of_the_image(person):
     assert not report.warnings
 
 
+def test_who_lies_with_the_head_towards_the_camera_is_no_doubt():
+    body = SMPL.load()
+    pose = torch.zeros(24, 3)
+    pose[JOINT_INDEX["l_shoulder"], 2], pose[JOINT_INDEX["r_shoulder"], 2] = -1.3, 1.3
+    vertices, joints = body(pose.flatten(), torch.zeros(10))
+    lying = (vertices - joints[ROOT])[:, [0, 2, 1]] * torch.tensor([1.0, -1, -1]) + torch.tensor(
+        [0, 0.4, 2.3]
+    )
+    depth = get_renderer("zbuffer")(lying[None], body.faces, CAMERA)[0].numpy()
+    body_depth(depth, CAMERA, None, report := Report())
+    assert report.facts["area_m2"] < 0.15  # no more than of a child who stands
+    assert not report.warnings
+
+
+def test_what_reaches_farther_than_a_person_is_doubted():
+    metres = np.zeros((512, 424), np.float32)
+    metres[190:320, 40:95] = metres[190:320, 325:380] = metres[250:260, 40:380] = 2.4
+    body_depth(metres, CAMERA, None, report := Report())
+    assert report.facts["area_m2"] < 0.85
+    assert "much for a person: are there two" in report.warnings[0]
+
+
+def _with_another(person, aside_px, seen_px):
+    """Somebody else 0.6 m behind and aside, whom a table hides from the row `seen_px` on."""
+    aside = np.roll(np.where(person > 0, person + np.float32(0.6), 0), -aside_px, 1)
+    aside[seen_px:] = 0
+    return np.where(person > 0, person, aside)
+
+
 def test_a_second_person_is_doubted(person):
-    aside = np.roll(np.where(person > 0, person + np.float32(0.6), 0), -150, 1)
-    aside[270:] = 0  # behind a table
-    report = Report()
-    body_depth(np.where(person > 0, person, aside), CAMERA, None, report)
+    body_depth(_with_another(person, 90, 220), CAMERA, None, report := Report())
     assert "somebody else" in " ".join(report.warnings)
+
+
+def test_two_people_who_are_too_large_for_one_are_refused(person):
+    with pytest.raises(
+        ValueError, match=r"much for a person, and a piece.* apart.*give a mask of the person alone"
+    ):
+        body_depth(_with_another(person, 150, 270), CAMERA)
 
 
 def test_masks_as_people_have_them(person):
