@@ -39,8 +39,8 @@ _NEEDED = ("task.input", "task.camera")
 _CHECKPOINTS = ("ckpt_path", "task.mesh_ckpt_path")
 _OPTIONAL = ("task.keypoints", "task.mask", "task.rgb", "task.keypoint_detector")
 _COMMAND = (
-    "python run.py task=predict task.input=DEPTH.png task.camera=CAMERA.yaml task.keypoints=KEYPOINTS.json "
-    "ckpt_path=DETECTOR.ckpt task.mesh_ckpt_path=MESH.ckpt"
+    "python run.py task=predict input=DEPTH.png camera=CAMERA.yaml, with checkpoints of your own "
+    "ckpt_path=DETECTOR.ckpt mesh_ckpt_path=MESH.ckpt"
 )
 
 
@@ -102,7 +102,8 @@ def predict(cfg: DictConfig) -> dict[str, float]:
     if task.keypoints is None and pipeline.needs_keypoints:
         raise ValueError(
             f"task.keypoints: expected a path, since the detector '{package or cfg.ckpt_path}' takes keypoints, got "
-            f"null; {_COMMAND}, or a detector that can do without: experiment=detector/cascade"
+            "null; add keypoints=KEYPOINTS.json or keypoint_detector=cpn_depth, or take a detector that can do "
+            "without: experiment=detector/cascade"
         )
     if forms and pipeline.regressor is None:
         raise ValueError(

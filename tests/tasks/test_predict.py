@@ -183,7 +183,7 @@ NEEDED = ["task.input", "task.camera", "ckpt_path"]
 @pytest.mark.parametrize("key", NEEDED)
 def test_what_a_prediction_needs_is_named(key, config):
     with pytest.raises(
-        ValueError, match=rf"{key}: expected a path, got null; python run\.py task=predict task\."
+        ValueError, match=rf"{key}: expected a path, got null; python run\.py task=predict input="
     ):
         predict(config(f"{key}=null"))
 
