@@ -1,9 +1,10 @@
 # make demo | ar-demo | train-demo | test | lint | bench | install: each installs what it needs into .venv first.
+# make clean removes .venv and what tools left; outputs stay.
 PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo ar-demo train-demo test lint bench install clean
+.PHONY: demo ar-demo train-demo test lint bench install clean help
 
 demo: install
 	$(BIN)/python run.py task=demo refine=true
@@ -39,3 +40,6 @@ $(VENV)/.installed: pyproject.toml
 
 clean:
 	rm -rf $(VENV) build *.egg-info .pytest_cache .ruff_cache .mypy_cache
+
+help:
+	@sed -n 's/^# //p' Makefile
