@@ -3,7 +3,7 @@
 python run.py --help                                       the configuration and its groups
 python run.py experiment=detector/proposed                 train, then test the best checkpoint
 python run.py task=evaluate ckpt_path=CHECKPOINT           test a checkpoint
-python run.py task=predict task.input=DEPTH.png ...        joints and mesh of a depth image
+python run.py task=predict input=DEPTH.png ...             joints and mesh of a depth image
 """
 
 import logging
