@@ -16,7 +16,8 @@ from ljn.runs.keys import key_of
 
 _SHORT = {
     **dict.fromkeys(("input", "camera"), ("task=predict", "task=ar")),
-    **dict.fromkeys(("keypoints", "mask", "rgb"), ("task=predict",)),
+    **dict.fromkeys(("keypoints", "mask", "mask_id", "rgb"), ("task=predict",)),
+    "strict": ("task=predict", "task=ar"),
     "keypoint_detector": ("task=predict", "task=ar", "task=package", "task=benchmark"),
     "mesh_ckpt_path": ("task=predict", "task=ar", "task=demo", "task=package", "task=benchmark"),
 }
@@ -32,7 +33,7 @@ _OF_TASKS = {
 }
 """Keys of the root, and the tasks that read them; a training, to refuse them."""
 _PATHS = (
-    *(f"task.{name}" for name in (*_SHORT, "directory")),
+    *(f"task.{name}" for name in (*_SHORT, "directory") if name not in ("mask_id", "strict")),
     *("ckpt_path", "weights", "paths.output_dir", "paths.cache_dir", "body.path"),
     *("data.detector_ckpt", "data.keypoint_ckpt", "bench.path", "bench.samples.path"),
 )

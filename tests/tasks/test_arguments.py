@@ -63,6 +63,11 @@ def test_a_key_that_has_moved_is_named(run_py):
     assert prepare_arguments(["task=predict", "input=a=b.png"]) == ["task=predict", "task.input='a=b.png'"]
 
 
+def test_a_short_key_that_is_no_path_is_left_unquoted():
+    given = ["task=predict", "strict=true", "mask_id=3"]
+    assert prepare_arguments(given) == ["task=predict", "task.strict=true", "task.mask_id=3"]
+
+
 def test_a_key_of_several_tasks_is_short_in_each():
     for task in ("task=predict", "task=demo", "task=package"):
         assert prepare_arguments([task, "mesh_ckpt_path=a=b"]) == [task, "task.mesh_ckpt_path='a=b'"]
