@@ -37,6 +37,7 @@ from ljn.system.system import ArResult, ArSystem
 from ljn.system.video import contact_sheet, write_video
 from ljn.system.view import WebView
 from ljn.tasks.package import chosen_package
+from ljn.tasks.running import use_threads
 from ljn.tasks.validation import check_writable
 
 _LOG = logging.getLogger(__name__)
@@ -80,8 +81,7 @@ def ar(cfg: DictConfig) -> dict[str, float]:
     smoothing = None
     if task.smooth:
         smoothing = SmoothingSettings(**(OmegaConf.to_container(task.smoothing) or {}))  # type: ignore[arg-type]
-    if cfg.num_threads is not None:
-        torch.set_num_threads(cfg.num_threads)
+    use_threads(cfg)
     pipeline = _pipeline(cfg)
     segmenter = None if cfg.segmentation is None else build(cfg.segmentation)
     directory = Path(cfg.paths.output_dir) / _RESULTS / _name(cfg, recording)

@@ -17,6 +17,7 @@ from ljn.runs.files import path_part
 from ljn.runs.packages import DEFAULT, is_package, shipped
 from ljn.tasks.overrides import typed_overrides
 from ljn.tasks.package import chosen_package
+from ljn.tasks.running import use_threads
 from ljn.tasks.validation import check_writable
 
 _LOG = logging.getLogger(__name__)
@@ -46,8 +47,7 @@ def benchmark(cfg: DictConfig) -> dict[str, float]:
         )
     directory = Path(cfg.paths.output_dir) / "benchmarks"
     check_writable(directory)
-    if cfg.num_threads is not None:
-        torch.set_num_threads(cfg.num_threads)
+    use_threads(cfg)
     entrants = _entrants(cfg)
     bench = build(cfg.bench)
     store = Store(directory / "conditions", reads=not cfg.rerun)

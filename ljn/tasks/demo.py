@@ -21,6 +21,7 @@ from ljn.pipeline.writing import write_arrays, write_mesh
 from ljn.runs import layout
 from ljn.runs.files import write_text_atomically
 from ljn.tasks.package import chosen_package
+from ljn.tasks.running import use_threads
 from ljn.tasks.validation import check_writable
 
 _COMMAND_OF_PREDICT = "python run.py task=predict input=DEPTH.png camera=CAMERA.yaml mask=MASK.png"
@@ -68,8 +69,7 @@ def demo(cfg: DictConfig) -> dict[str, float]:
     samples = find_samples(cfg.task.directory or FRAMES)
     directory, export = (Path(cfg.paths.output_dir) / name for name in ("demo", "export"))
     check_writable(directory)
-    if cfg.num_threads is not None:
-        torch.set_num_threads(cfg.num_threads)
+    use_threads(cfg)
     pipeline = _pipeline(cfg)
     body_path = cfg.body.path if cfg.task.directory else None
 

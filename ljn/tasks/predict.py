@@ -29,6 +29,7 @@ from ljn.refinement import chosen_settings
 from ljn.runs.files import path_part, write_json
 from ljn.runs.packages import DEFAULT, shipped
 from ljn.tasks.package import chosen_package
+from ljn.tasks.running import use_threads
 from ljn.tasks.validation import check_writable
 
 _LOG = logging.getLogger(__name__)
@@ -86,8 +87,7 @@ def predict(cfg: DictConfig) -> dict[str, float]:
             )
     directory = _directory(cfg.paths.output_dir, task.input)
     check_writable(directory)
-    if cfg.num_threads is not None:
-        torch.set_num_threads(cfg.num_threads)
+    use_threads(cfg)
     use_gpu = cfg.trainer.accelerator != "cpu" and torch.cuda.is_available()
     device = "cuda" if use_gpu else "cpu"
     if package:

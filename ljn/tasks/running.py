@@ -47,13 +47,22 @@ def prepare_process(cfg: DictConfig) -> None:
     for message in _EXPECTED_WARNINGS:
         warnings.filterwarnings("ignore", message)
     lightning.seed_everything(cfg.seed, workers=True, verbose=False)
-    # With a thread on every core, each parallel region waits for the one that shares its core with a worker.
     number = num_processes(cfg.trainer)
-    num_threads = cfg.num_threads or max(1, _num_cores() // (2 * number))
-    torch.set_num_threads(num_threads)
+    num_threads = use_threads(cfg, number)
     if number > 1:
         # Where this is not set, Lightning gives each of several processes its share of all cores.
         os.environ.setdefault("OMP_NUM_THREADS", str(num_threads))
+
+
+def use_threads(cfg: DictConfig, num_processes: int = 1) -> int:
+    """Let PyTorch use as many threads as `num_threads` says; returns their number.
+
+    Null: half of the process's cores. With a thread on every core, each parallel region waits for the one that shares
+    its core with something else: a data worker, or what else a prediction does.
+    """
+    num_threads: int = cfg.num_threads or max(1, _num_cores() // (2 * num_processes))
+    torch.set_num_threads(num_threads)
+    return num_threads
 
 
 def _num_cores() -> int:
