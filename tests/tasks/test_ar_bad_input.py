@@ -330,6 +330,7 @@ def test_a_sensor_without_a_frame_is_an_error(compose_config, good, pipeline, mo
         run(compose_config, tmp_path, "live:replay:nothing")
 
 
+@pytest.mark.slow
 def test_the_command_s_exit_code_says_whether_anything_could_be_done(run_py, good, tmp_path):
     folder = Folder(tmp_path / "damaged", good)
     cut_short(folder)

@@ -205,7 +205,7 @@ import ljn
 from ljn import Camera, Pipeline
 assert ljn.__file__.startswith(sys.argv[1]), ljn.__file__
 depth = np.zeros((512, 424), np.float32)
-depth[100:400, 180:240] = 2
+depth[100:400, 180:240] = 2 + 0.1 * np.sin(np.linspace(0, 3, 60))
 pipeline = Pipeline.from_pretrained("small", refine=True)
 print(pipeline(depth, Camera(366, 366, 206, 253, 424, 512)).vertices.shape)
 """
@@ -263,6 +263,7 @@ def test_a_keypoint_detector_is_a_package_of_its_own_and_finds_keypoints_in_pred
         package(smoke_config(tmp_path, "task=package", *given, *checkpoints, "task.licence=CC0-1.0"))
 
 
+@pytest.mark.slow
 def test_a_training_begins_with_a_package_s_weights_but_for_those_of_another_shape(
     write_checkpoint, smoke_config, tmp_path
 ):

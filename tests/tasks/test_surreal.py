@@ -132,6 +132,7 @@ def tree_in_colour(tmp_path_factory):
     return root
 
 
+@pytest.mark.slow
 def test_keypoints_are_trained_on_surreals_frames_and_evaluated_on_them(
     smoke_config, tmp_path, tree_in_colour
 ):
@@ -155,6 +156,7 @@ def test_keypoints_are_trained_on_surreals_frames_and_evaluated_on_them(
     assert own["test/keypoint_error_px"] != again["test/keypoint_error_px"]
 
 
+@pytest.mark.slow
 def test_a_checkpoint_of_rendered_people_is_evaluated_on_frames_without_photographs(
     write_checkpoint, smoke_config, tmp_path, tree_in_colour
 ):
