@@ -99,6 +99,7 @@ def test_a_call_that_was_cut_off_leaves_a_video_and_the_same_call_goes_on(
     assert recording.asked == [0, 1]
 
 
+@pytest.mark.slow
 def test_what_is_complete_is_not_made_again(recording, compose_config, tmp_path, monkeypatch, caplog):
     cfg = config(compose_config, tmp_path, "task.max_frames=2")
     first = ar(cfg)

@@ -11,6 +11,7 @@ from ljn.tasks.train import composed, train
 CONF = Path(__file__).parents[2] / "conf"
 
 
+@pytest.mark.slow
 def test_a_run_is_trained_once_and_tested_on_other_data(smoke_config, tmp_path):
     metrics = {}
     for noise_px in (0, 15):
@@ -104,6 +105,7 @@ def test_the_detector_of_a_chain_is_for_its_test_alone(smoke_config, monkeypatch
     assert detectors[1]["path"].startswith(str(tmp_path / "runs" / "detector-cascade-"))
 
 
+@pytest.mark.slow
 def test_a_training_begins_with_another_s_weights_and_takes_a_detector_s_joints(
     smoke_config, monkeypatch, tmp_path
 ):

@@ -168,6 +168,7 @@ def test_a_mesh_checkpoint_carries_the_detector_that_it_was_trained_on(
         found()
 
 
+@pytest.mark.slow
 def test_refined_meshes_have_metrics_beside_the_others(smoke_config, tmp_path):
     call = ("task=evaluate", "weights=small", "task.stage=mesh", "data.num_test=8", "data.num_workers=0")
     typed = ["data.num_test=8", "data.num_workers=0", "data.sensor.strength=0"]

@@ -35,6 +35,7 @@ def test_every_table_has_a_sweep_and_all_of_the_thesis_are_in_all_tables():
     assert set(SWEEPS["all_tables"].tables) == set(TABLES) - {"demo", "backgrounds"}
 
 
+@pytest.mark.slow
 def test_all_tables_train_each_distinct_configuration_once(smoke_config, tmp_path):
     configs = {name: smoke_config(tmp_path, f"experiment={name}") for name in experiments("all_tables")}
     hashes = {}
