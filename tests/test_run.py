@@ -65,6 +65,7 @@ def test_a_user_error_is_one_message_without_a_traceback(tmp_path):
     assert "Traceback" not in done.stderr
 
 
+@pytest.mark.slow
 def test_the_demo_sweep_runs_every_row_and_one_that_fails_costs_the_others_nothing(tmp_path):
     done = python(
         *("run.py", "sweep=demo", f"paths.output_dir={tmp_path}", "preset.num_train=32", "preset.num_val=8"),

@@ -81,6 +81,7 @@ def tracked(smoke_config, tmp_path_factory):
     return [Path(cfg.paths.run_dir) for cfg in (run, evaluation)]
 
 
+@pytest.mark.slow
 def test_each_job_of_a_sweep_is_a_wandb_run_of_its_group(tracked):
     seen = []
     for run_dir, job_type in zip(tracked, ("train", "evaluate")):
@@ -96,6 +97,7 @@ def test_each_job_of_a_sweep_is_a_wandb_run_of_its_group(tracked):
     assert len(set(seen)) == 2
 
 
+@pytest.mark.slow
 def test_an_evaluation_names_its_training_run(tracked):
     [records] = records_of(tracked[1] / "wandb")
     run, config, _ = described(records)

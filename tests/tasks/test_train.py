@@ -163,8 +163,8 @@ def uninterrupted(smoke_config, tmp_path_factory):
     ("experiment", "epoch", "num_workers"),
     [
         ("detector/proposed", 2, 0),
-        ("detector/proposed", 1, 1),
-        ("detector/proposed", 2, 2),
+        pytest.param("detector/proposed", 1, 1, marks=pytest.mark.slow),
+        pytest.param("detector/proposed", 2, 2, marks=pytest.mark.slow),
         ("detector/simple_baseline", 2, 1),  # with dropout
     ],
 )
@@ -295,6 +295,7 @@ def start(directory, *overrides):
     )
 
 
+@pytest.mark.slow
 def test_sigterm_and_ctrl_c_are_said_and_recorded_and_the_run_goes_on(tmp_path):
     overrides = ("experiment=detector/basic", "trainer.max_epochs=400")
 
