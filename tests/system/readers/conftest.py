@@ -2,7 +2,8 @@ import numpy as np
 import pytest
 
 from ljn.geometry.camera import Camera
-from ljn.system.readers import LensCamera
+from ljn.system.readers import LensCamera, Recorder
+from ljn.system.recording import RgbdFrame
 
 DEPTH_CAMERA = Camera(fx=91.6, fy=91.7, cx=62.5, cy=54.0, width=128, height=106)
 RGB_CAMERA = Camera(fx=141.0, fy=141.5, cx=119.0, cy=68.0, width=240, height=135)
@@ -74,3 +75,12 @@ def frames(scene):
 @pytest.fixture(scope="session")
 def depth_camera():
     return LensCamera(DEPTH_CAMERA)
+
+
+@pytest.fixture
+def walk(frames, tmp_path):
+    """A recording of our format, ten frames a second."""
+    with Recorder(tmp_path / "walk", DEPTH_CAMERA) as recorder:
+        for i, (depth, rgb) in enumerate(zip(*frames)):
+            recorder.write(RgbdFrame(i, f"{i:04d}", depth, rgb, i / 10))
+    return tmp_path / "walk"

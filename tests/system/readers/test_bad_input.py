@@ -8,15 +8,6 @@ from tests.system.readers.conftest import DEPTH_CAMERA, RGB_CAMERA
 from tests.system.readers.test_layouts import integers, write_camera, write_png, write_tum, write_video
 
 
-@pytest.fixture
-def walk(frames, tmp_path):
-    """A recording of our format that may be damaged."""
-    with Recorder(tmp_path / "walk", DEPTH_CAMERA) as recorder:
-        for i, (depth, rgb) in enumerate(zip(*frames)):
-            recorder.write(RgbdFrame(i, f"{i:04d}", depth, rgb, i / 10))
-    return tmp_path / "walk"
-
-
 def errors_of(recording):
     """The numbers of the frames that are marked, and why."""
     found = list(recording.frames())

@@ -1,9 +1,8 @@
 import numpy as np
 import pytest
 
-from ljn.system.readers import Recorder, open_recording
+from ljn.system.readers import open_recording
 from ljn.system.readers.live import Replay
-from ljn.system.recording import RgbdFrame
 from tests.system.readers.conftest import DEPTH_CAMERA
 
 
@@ -17,15 +16,6 @@ class Clock:
     def sleep(self, seconds):
         self.slept.append(seconds)
         self.now += seconds
-
-
-@pytest.fixture
-def walk(frames, tmp_path):
-    """A recording of ten frames a second."""
-    with Recorder(tmp_path / "walk", DEPTH_CAMERA) as recorder:
-        for i, (depth, rgb) in enumerate(zip(*frames)):
-            recorder.write(RgbdFrame(i, f"{i:04d}", depth, rgb, i / 10))
-    return tmp_path / "walk"
 
 
 def test_a_replay_keeps_the_recording_s_time(walk, frames):
