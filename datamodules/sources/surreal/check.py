@@ -14,6 +14,7 @@ from ljn.data import Finding
 
 _ROUNDING_PX = 0.5
 _TOLERANCE_PX = 0.01
+_NEAR_M = 1.0  # from the camera's plane: nearer, the rounding of numbers of 32 bits shows
 _SAME_MM = 5.0
 
 
@@ -66,11 +67,15 @@ def examine_clips(
 def beyond_rounding_px(clip: FilmedClip, frames: np.ndarray, joints: np.ndarray) -> float:
     """The largest distance along u or v between joints `(n, 24, 3)` in the image and the file's, less that of rounding.
 
-    Joints are in SURREAL's world, metres. Infinite where one lies behind the camera.
+    Joints are in SURREAL's world, metres; people walk past its camera. Those within 1 m of the camera's plane are not
+    compared; infinite if that is all of them.
     """
-    seen = to_pixels(to_mirrored_camera(joints, clip.camera_place))
-    error = np.abs(seen - clip.pixels[frames]).max(initial=0.0) - _ROUNDING_PX
-    return float(max(0.0, error)) if np.isfinite(error) else float("inf")
+    seen = to_mirrored_camera(joints, clip.camera_place)
+    is_compared = np.abs(seen[..., 2]) > _NEAR_M
+    if not is_compared.any():
+        return float("inf")
+    error = np.abs(to_pixels(seen[is_compared]) - clip.pixels[frames][is_compared]).max() - _ROUNDING_PX
+    return float(max(0.0, error))
 
 
 def _of_bodies(body_mm: Sequence[float], bodies: Sequence[BodyModel]) -> Finding:

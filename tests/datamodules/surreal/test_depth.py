@@ -14,7 +14,14 @@ from ljn.body import SMPL
 from ljn.geometry.camera import project
 from ljn.geometry.rotations import body_to_camera
 from ljn.render import get_renderer
-from tests.datamodules.surreal.writer import clip_path, make_clip, make_images, write_clip, write_mat
+from tests.datamodules.surreal.writer import (
+    clip_path,
+    make_clip,
+    make_images,
+    projection,
+    write_clip,
+    write_mat,
+)
 
 
 @pytest.fixture(autouse=True)
@@ -63,6 +70,18 @@ def test_another_body_and_another_camera_are_told_apart(tmp_path, surreal_bodies
         *_, camera = findings(SurrealSource(tmp_path), surreal_bodies)
         assert camera.is_wrong
         assert "beyond rounding from joints2D, expected 0" in camera.text
+
+
+def test_who_walks_past_the_camera_is_no_error_of_it(tmp_path, surreal_bodies):
+    fields, _ = make_clip(num_frames=40)
+    place = fields["camLoc"].ravel().astype(float)
+    fields["joints3D"][0] += np.linspace(0, 12, 40)  # from six metres before it to six behind
+    joints = fields["joints3D"].transpose(2, 1, 0).astype(float)
+    seen = np.concatenate([joints, np.ones((40, 24, 1))], -1) @ projection(place).T
+    fields["joints2D"] = np.round(seen[..., :2] / seen[..., 2:]).transpose(2, 1, 0)
+    write_mat(Path(f"{clip_path(tmp_path, 'test', '01_01')}_info.mat"), fields)
+    *_, camera = findings(SurrealSource(tmp_path), surreal_bodies)
+    assert "0 px beyond rounding: all is well" in camera.text
 
 
 def test_damaged_clips_are_named_and_the_check_goes_on(tmp_path, surreal_bodies):
