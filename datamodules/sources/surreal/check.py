@@ -23,14 +23,15 @@ def examine_clips(
 ) -> Iterator[Finding]:
     """A line for each of so many clips from all over the tree, or of all, and what they say together.
 
-    Two checks, each at its own place. `camera`: the file's 3D joints through SURREAL's camera against its 2D joints, no
-    body taking part: by how much they differ beyond the rounding to whole pixels, the largest over frames and joints.
-    `body`: the file's pose and shape through the loaded body against its 3D joints, mean and largest, mm; and these
-    joints through the camera against the 2D joints, pixels.
+    Files of which the index says that they cannot be read are counted. Two checks, each at its own place. `camera`: the
+    file's 3D joints through SURREAL's camera against its 2D joints, no body taking part: by how much they differ beyond
+    the rounding to whole pixels, the largest over frames and joints. `body`: the file's pose and shape through the
+    loaded body against its 3D joints, mean and largest, mm; and these joints through the camera against the 2D joints,
+    pixels.
     """
-    chosen = entries
+    chosen = readable = [entry for entry in entries if not entry.problem]
     if num_clips is not None:
-        chosen = [entries[i] for i in np.unique(np.linspace(0, len(entries) - 1, num_clips).astype(int))]
+        chosen = [readable[i] for i in np.unique(np.linspace(0, len(readable) - 1, num_clips).astype(int))]
     posed = ClipBodies(bodies)
     num_damaged = 0
     camera_px: list[float] = []
@@ -56,7 +57,12 @@ def examine_clips(
             f"{errors.max():.1f} mm, {body_px:.2f} px",
             {"camera_px": camera_px[-1], "body_mm": float(errors.max()), "body_px": body_px},
         )
-    yield Finding(f"{len(chosen)} clips, {num_damaged} of them damaged", {"damaged": float(num_damaged)})
+    num_unreadable = len(entries) - len(readable)
+    yield Finding(
+        f"{len(chosen)} of {len(readable)} clips, {num_damaged} of them damaged; {num_unreadable} other files cannot "
+        "be read",
+        {"damaged": float(num_damaged + num_unreadable)},
+    )
     if camera_px:
         yield _of_bodies(body_mm, bodies)
         yield _of_camera(max(camera_px))

@@ -75,7 +75,10 @@ def _read_older(file: IO[bytes], names: Collection[str]) -> dict[str, np.ndarray
     header = file.read(_HEADER)
     order = {b"IM": "<", b"MI": ">"}.get(header[126:128], "")
     if not order or header[125 if order == "<" else 124] != 1:
-        raise ValueError("it does not begin as one")
+        is_page = header.lstrip().startswith(b"<")
+        raise ValueError(
+            "it is a web page" if is_page else "it does not begin as one" if header else "it is empty"
+        )
     found, place = {}, _HEADER
     while place < size:
         file.seek(place)

@@ -139,9 +139,7 @@ class SurrealSource:
 
     def examine(self, bodies: Sequence[BodyModel], num_clips: int | None) -> Iterator[Finding]:
         """See `Examinable`: cameras and bodies, of clips of all splits."""
-        yield from examine_clips(
-            self.tree, [entry for entry in self.entries if not entry.problem], bodies, num_clips
-        )
+        yield from examine_clips(self.tree, self.entries, bodies, num_clips)
 
     def motion(self, split: str) -> dict[str, int]:
         """See `PoseSource.motion`: also subjects and sequences, and the files of the split that cannot be read."""

@@ -91,11 +91,12 @@ def test_damaged_clips_are_named_and_the_check_goes_on(tmp_path, surreal_bodies)
     del fields["joints3D"]
     write_mat(Path(f"{clip_path(tmp_path, 'test', '01_01', 2)}_info.mat"), fields)
     write_clip(tmp_path, "test", "01_01", 3, num_frames=6, fields={"joints3D": np.full((3, 24, 6), np.nan)})
+    Path(f"{clip_path(tmp_path, 'test', '01_01', 4)}_info.mat").write_bytes(b"")
     found = findings(SurrealSource(tmp_path), surreal_bodies)
     text = "\n".join(each.text for each in found)
     assert "01_01_c0002_info.mat: no field joints3D" in text
     assert "c0003_info.mat: no frame of 6 is whole" in text
-    assert "3 clips, 2 of them damaged" in text
+    assert "3 of 3 clips, 2 of them damaged; 1 other files cannot be read" in text
     assert not found[-1].is_wrong
     write_mat(Path(f"{clip_path(tmp_path, 'test', '01_01')}_info.mat"), fields)
     assert findings(SurrealSource(tmp_path), surreal_bodies)[-1].is_wrong

@@ -91,6 +91,9 @@ def test_a_truncated_and_a_renamed_file_are_called_damaged(tmp_path, h5py):
         path.write_bytes(content)
         with pytest.raises(ValueError, match=r"a_info\.mat: cannot be read as a MATLAB file"):
             read_clip(path)
+    path.write_bytes(b"\n<!DOCTYPE html><html>401 Unauthorized</html>")
+    with pytest.raises(ValueError, match="it is a web page"):
+        read_clip(path)
     with pytest.raises(FileNotFoundError):
         read_clip(tmp_path / "none.mat")
 

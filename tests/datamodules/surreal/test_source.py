@@ -166,6 +166,52 @@ def test_an_index_that_was_cut_off_is_gone_on_with_and_a_changed_file_is_read_ag
     assert read == [file.name]
 
 
+def test_strays_are_passed_over_or_named_and_what_becomes_readable_is_read(tmp_path, caplog):
+    for number in (1, 2):
+        write_plain(tmp_path, "train", "01_01", number)
+    folder = clip_path(tmp_path, "train", "01_01").parent
+    target = tmp_path / "elsewhere.mat"
+    (folder / "01_01_c0003_info.mat").symlink_to(target)
+    (folder / "01_01_c0004_info.mat").mkdir()
+    os.mkfifo(folder / "01_01_c0005_info.mat")
+    for name in ("._01_01_c0001_info.mat", ".DS_Store", "01_01_c0001_info copy.mat", "../.DS_Store"):
+        (folder / name).write_bytes(b"of another program")
+    (folder.parent / "self").symlink_to("self")
+
+    def problems():
+        source = SurrealSource(tmp_path)
+        source.cache_dir = tmp_path / "cache"
+        return {entry.name[-5:]: entry.problem for entry in source.entries}
+
+    found = problems()
+    assert [name for name, problem in found.items() if not problem] == ["c0001", "c0002"]
+    assert "01_01_c0003_info.mat" in found["c0003"]
+    assert all("expected a file, got a folder, or a pipe" in found[name] for name in ("c0004", "c0005"))
+    assert "3 of 5 files, and 0 frames of others, are left out" in caplog.text
+    [index] = (tmp_path / "cache").iterdir()
+    size = index.stat().st_size
+    assert problems() == found
+    assert index.stat().st_size < size + 10, "what is still wrong is not written again"
+    target.write_bytes((folder / "01_01_c0001_info.mat").read_bytes())
+    assert not problems()["c0003"]
+
+
+def test_a_folder_that_cannot_be_listed_is_named_and_the_rest_goes_on(tmp_path, monkeypatch):
+    for sequence in ("01_01", "02_01"):
+        write_plain(tmp_path, "train", sequence)
+    listed = os.listdir
+
+    def refused(path):
+        if Path(path).name == "02_01":
+            raise PermissionError(13, "Permission denied", str(path))
+        return listed(path)
+
+    monkeypatch.setattr(os, "listdir", refused)
+    first, second = SurrealSource(tmp_path).entries
+    assert not first.problem
+    assert "train/run0/02_01/*_info.mat" in second.problem
+
+
 def test_names_are_those_of_sequences_and_subjects():
     for folder, sequence, subject in (
         ("01_01", "1_1", "1"), ("ung_104_02", "104_2", "104"), ("143_21", "143_21", "143"), ("h36m", "h36m", "h36m"),
