@@ -83,8 +83,10 @@ class SurrealSource:
         self.genders = tuple(genders)
 
     def check(self) -> None:
-        """Read the index, or make it; see `PoseSource.check`."""
-        _ = self._parts
+        """Read the index, or make it, and say which splits have nothing in it; see `PoseSource.check`."""
+        for split in SPLITS:
+            if not self._parts[split]:
+                _LOG.warning("SURREAL: %s", self._nothing_for(split))
 
     @property
     def fingerprint(self) -> str:
@@ -131,6 +133,17 @@ class SurrealSource:
     @property
     def _named_files(self) -> str:
         return ", ".join(f"*{end}" for end in self.files)
+
+    def _nothing_for(self, split: str) -> str:
+        """Why a split has no clip."""
+        folders = [self.tree / part / self.run for part in (("val", "test") if split == "val" else (split,))]
+        names = " and ".join(map(str, folders))
+        if not any(folder.is_dir() for folder in folders):
+            return f"no clip for '{split}': there is no {names}; download this part of SURREAL, too"
+        return (
+            f"no usable clip for '{split}' in {names}: all are too short, damaged, skipped, of subjects of the test "
+            f"set, or not whole ({self._named_files})"
+        )
 
     def _is_usable(self, entry: ClipEntry) -> bool:
         is_skipped = entry.subject in self.skip or entry.sequence in self.skip
@@ -197,10 +210,7 @@ class SurrealSource:
             raise ValueError(f"split: expected one of {', '.join(SPLITS)}, got '{split}'")
         clips = self._parts[split]
         if not clips:
-            raise ValueError(
-                f"data.source.path: no usable clip for '{split}' in {self.tree}/{split}/{self.run}: all are too short, "
-                f"damaged, skipped, of subjects of the test set, or not whole ({self._named_files})"
-            )
+            raise ValueError(f"data.source.path: {self._nothing_for(split)}")
         number = min(len(clips), max(1, num_records // self.samples_per_clip))
         chosen = np.sort(rng.permutation(len(clips))[:number])
         frames = [clips[i].good_frames for i in chosen]

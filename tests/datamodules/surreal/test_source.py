@@ -230,7 +230,7 @@ def test_what_is_damaged_is_named_and_counted(tree, caplog):
     assert "subjects 22 are in training and test" in caplog.text
 
 
-def test_a_missing_tree_is_named_with_what_was_expected(tmp_path, tree):
+def test_a_missing_tree_is_named_with_what_was_expected(tmp_path, tree, caplog):
     for path in (None, tmp_path / "none"):
         with pytest.raises(
             FileNotFoundError, match=r"path: expected the folder of SURREAL with cmu/.*registration"
@@ -247,12 +247,18 @@ def test_a_missing_tree_is_named_with_what_was_expected(tmp_path, tree):
     with pytest.raises(ValueError, match=r"of 1 clips in .* none has 6 frames or more"):
         SurrealSource(tmp_path).check()
     write_plain(tmp_path, "test", "01_01", 2)
-    with pytest.raises(ValueError, match="no usable clip for 'train'"):
+    with caplog.at_level(logging.WARNING):
+        SurrealSource(tmp_path).check()
+    assert "no clip for 'train': there is no" in caplog.text
+    with pytest.raises(ValueError, match=r"'train': there is no .*cmu/train/run0; download this part"):
+        SurrealSource(tmp_path).records("train", 3, 0)
+    write_plain(tmp_path, "train", "18_01")
+    with pytest.raises(ValueError, match=r"no usable clip for 'train' in .* skipped"):
         SurrealSource(tmp_path).records("train", 3, 0)
     assert len(SurrealSource(tmp_path).records("val", 3, 0)) == 3, "of test, where there is no val"
-    for number in (1, 2):
-        write_plain(tmp_path, "test", "01_01", number, gender=4)
-    with pytest.raises(ValueError, match=r"none of 2 files can be read; the first: .*gender: expected 0"):
+    for split, sequence, number in (("train", "18_01", 1), ("test", "01_01", 1), ("test", "01_01", 2)):
+        write_plain(tmp_path, split, sequence, number, gender=4)
+    with pytest.raises(ValueError, match=r"none of 3 files can be read; the first: .*gender: expected 0"):
         SurrealSource(tmp_path).check()
 
 
