@@ -81,6 +81,12 @@ class FilmedSource(SurrealSource, Generic[Image]):
     def check(self) -> None:
         """Read the index, or make it, and find out what kind of images and whose bodies there are."""
         super().check()
+        usable = [entry for entry in self.entries if SurrealSource._is_usable(self, entry)]
+        if lacking := [missing for entry in usable for missing in self._missing(entry)[:1]]:
+            _LOG.warning(
+                "left out: %d of %d clips, which have not all of %s; the first: there is no %s",
+                len(lacking), len(usable), self._named_files, lacking[0],
+            )  # fmt: skip
         _ = self.kind, self.is_of_bodies
 
     @cached_property
@@ -95,9 +101,11 @@ class FilmedSource(SurrealSource, Generic[Image]):
         return {name: value for name, value in self.__dict__.items() if name not in ("_bodies", "_sample")}
 
     def _is_usable(self, entry: ClipEntry) -> bool:
-        return super()._is_usable(entry) and all(
-            (self.tree / f"{entry.name}{end}").is_file() for end in self.files
-        )
+        return super()._is_usable(entry) and not self._missing(entry)
+
+    def _missing(self, entry: ClipEntry) -> list[Path]:
+        files = [self.tree / f"{entry.name}{end}" for end in self.files]
+        return [file for file in files if not file.is_file()]
 
     @cached_property
     def _sample(self) -> list[tuple[FilmedClip, int, Image]]:
