@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from datamodules.scenes import Scene
-from datamodules.sources import PoseRecords
+from datamodules.sources import SPLITS, PoseRecords
 from datamodules.sources.surreal.bodies import ClipBodies
 from datamodules.sources.surreal.files import INFO, SEGMENTATION, FilmedClip, read_filmed_clip, read_images
 from datamodules.sources.surreal.index import ClipEntry
@@ -73,20 +73,14 @@ class FilmedSource(SurrealSource, Generic[Image]):
 
     @property
     def fingerprint(self) -> str:
-        """See `PoseSource.fingerprint`: also of the bodies, and of the kind of images."""
+        """See `PoseSource.fingerprint`: also of the bodies, and of the kind and the sizes of images."""
         bodies = sorted(body.hash for body in self._models)
-        made_of = f"{super().fingerprint} {bodies} {self.kind}"
+        made_of = f"{super().fingerprint} {bodies} {self.kind} {self._sizes}"
         return hashlib.sha256(made_of.encode()).hexdigest()[:16]
 
     def check(self) -> None:
         """Read the index, or make it, and find out what kind of images and whose bodies there are."""
         super().check()
-        usable = [entry for entry in self.entries if SurrealSource._is_usable(self, entry)]
-        if lacking := [missing for entry in usable for missing in self._missing(entry)[:1]]:
-            _LOG.warning(
-                "left out: %d of %d clips, which have not all of %s; the first: there is no %s",
-                len(lacking), len(usable), self._named_files, lacking[0],
-            )  # fmt: skip
         _ = self.kind, self.is_of_bodies
 
     @cached_property
@@ -104,8 +98,30 @@ class FilmedSource(SurrealSource, Generic[Image]):
         return super()._is_usable(entry) and not self._missing(entry)
 
     def _missing(self, entry: ClipEntry) -> list[Path]:
-        files = [self.tree / f"{entry.name}{end}" for end in self.files]
-        return [file for file in files if not file.is_file()]
+        return [file for file in self._files_of(entry) if not file.is_file()]
+
+    def _files_of(self, entry: ClipEntry) -> list[Path]:
+        return [self.tree / f"{entry.name}{end}" for end in self.files]
+
+    @cached_property
+    def _parts(self) -> dict[str, list[ClipEntry]]:
+        usable = [entry for entry in self.entries if SurrealSource._is_usable(self, entry)]
+        if lacking := [missing for entry in usable for missing in self._missing(entry)[:1]]:
+            _LOG.warning(
+                "left out: %d of %d clips, which have not all of %s; the first: there is no %s",
+                len(lacking), len(usable), self._named_files, lacking[0],
+            )  # fmt: skip
+        return super()._parts
+
+    @cached_property
+    def _sizes(self) -> str:
+        """Hash of the sizes of all files, which those have changed that were cut off and are copied again."""
+        digest = hashlib.sha256()
+        for split in SPLITS:
+            for entry in self._parts[split]:
+                sizes = [file.stat().st_size for file in self._files_of(entry)]
+                digest.update(f"{split} {entry.name} {sizes}\n".encode())
+        return digest.hexdigest()[:16]
 
     @cached_property
     def _sample(self) -> list[tuple[FilmedClip, int, Image]]:

@@ -83,10 +83,8 @@ class SurrealSource:
         self.genders = tuple(genders)
 
     def check(self) -> None:
-        """Read the index, or make it, and say which splits have nothing in it; see `PoseSource.check`."""
-        for split in SPLITS:
-            if not self._parts[split]:
-                _LOG.warning("SURREAL: %s", self._nothing_for(split))
+        """Read the index, or make it; see `PoseSource.check`."""
+        _ = self._parts
 
     @property
     def fingerprint(self) -> str:
@@ -128,6 +126,9 @@ class SurrealSource:
                 f"more, all of its files ({self._named_files}), and a subject that is not skipped "
                 "(data.source.skip)"
             )
+        for split in SPLITS:
+            if not parts[split]:
+                _LOG.warning("SURREAL: %s", self._nothing_for(split))
         return parts
 
     @property

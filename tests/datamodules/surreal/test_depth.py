@@ -193,11 +193,16 @@ def test_frames_whose_images_are_damaged_or_empty_are_left_out(tmp_path, caplog)
     assert set(records.sequence) == {"test/run0/01_01/01_01_c0001"}
     assert "01_01_c0002_depth.mat: " in caplog.text
     assert "6 of 9 samples of test come twice" in caplog.text
+    fingerprint = source.fingerprint
+    depth.write_bytes(Path(f"{first}_depth.mat").read_bytes())
+    again = SurrealDepthSource(tmp_path, radial=True)
+    assert again.fingerprint != fingerprint, "a file that was copied again is another"
     with caplog.at_level(logging.WARNING):
         SurrealDepthSource(tmp_path, radial=True).check()
     assert "left out: 1 of 4 clips, which have not all of *_info.mat, *_depth.mat, *_segm.mat" in caplog.text
     assert "there is no" in caplog.text
     assert "01_01_c0004_depth.mat" in caplog.text
-    depth.with_name("01_01_c0001_depth.mat").write_bytes(b"")
+    for number in (1, 2):
+        depth.with_name(f"01_01_c000{number}_depth.mat").write_bytes(b"")
     with pytest.raises(ValueError, match=r"no \*_depth\.mat in .* can be read, of 3 clips"):
         SurrealDepthSource(tmp_path).check()
