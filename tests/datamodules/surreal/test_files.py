@@ -109,6 +109,23 @@ def test_links_into_other_files_are_not_followed(tmp_path, h5py):
         read_clip(path)
 
 
+def test_a_field_of_hdf5_without_content_is_named(tmp_path, h5py):
+    write_mat73(tmp_path / "a_info.mat", plain_fields(), h5py)
+    with h5py.File(tmp_path / "a_info.mat", "r+") as file:
+        del file["gender"]
+        file["gender"] = h5py.Empty("f4")
+    with pytest.raises(ValueError, match=r"gender: expected .*, got"):
+        read_clip(tmp_path / "a_info.mat")
+
+
+def test_pieces_that_are_none_are_damage(tmp_path):
+    path = tmp_path / "a_info.mat"
+    write_mat(path, plain_fields())
+    path.write_bytes(path.read_bytes() + bytes(64))  # room for what has not come yet
+    with pytest.raises(ValueError, match="a piece of kind 0, where an array was expected"):
+        read_clip(path)
+
+
 def test_without_h5py_the_command_that_installs_it_is_named(tmp_path, monkeypatch, h5py):
     write_mat73(tmp_path / "a_info.mat", plain_fields(), h5py)
     monkeypatch.setitem(__import__("sys").modules, "h5py", None)
