@@ -196,9 +196,11 @@ class SurrealSource:
         path = self.tree / f"{entry.name}{INFO}"
         try:
             clip = read_clip(path)
-        except (ValueError, FileNotFoundError) as error:
+            if len(clip) != entry.num_frames:
+                raise ValueError(f"{path}: {len(clip)} frames, expected {entry.num_frames}")
+        except (ValueError, OSError) as error:
             raise ValueError(
-                f"{error} (it could be read when the tree was indexed: has it changed?)"
+                f"{error} (it was otherwise when the tree was indexed: has it changed?)"
             ) from error
         sequence = np.full(len(frames), entry.name)
         return clip.pose[frames], clip.betas[frames], clip.gender[frames], sequence, frames

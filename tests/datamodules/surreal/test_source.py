@@ -212,6 +212,15 @@ def test_a_folder_that_cannot_be_listed_is_named_and_the_rest_goes_on(tmp_path, 
     assert "train/run0/02_01/*_info.mat" in second.problem
 
 
+def test_a_clip_that_is_exchanged_after_the_index_is_named(tmp_path):
+    write_plain(tmp_path, "train", "01_01", num_frames=9)
+    source = SurrealSource(tmp_path)
+    source.check()
+    write_plain(tmp_path, "train", "01_01", num_frames=6)
+    with pytest.raises(ValueError, match=r"01_01_c0001_info\.mat: 6 frames, expected 9 .*has it changed"):
+        source.records("train", 9, 0)
+
+
 def test_names_are_those_of_sequences_and_subjects():
     for folder, sequence, subject in (
         ("01_01", "1_1", "1"), ("ung_104_02", "104_2", "104"), ("143_21", "143_21", "143"), ("h36m", "h36m", "h36m"),
