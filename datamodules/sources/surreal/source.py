@@ -138,7 +138,7 @@ class SurrealSource:
     def _nothing_for(self, split: str) -> str:
         """Why a split has no clip."""
         folders = [self.tree / part / self.run for part in (("val", "test") if split == "val" else (split,))]
-        names = " and ".join(map(str, folders))
+        names = " or ".join(map(str, folders))
         if not any(folder.is_dir() for folder in folders):
             return f"no clip for '{split}': there is no {names}; download this part of SURREAL, too"
         return (
