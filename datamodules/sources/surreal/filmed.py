@@ -75,7 +75,9 @@ class FilmedSource(SurrealSource, Generic[Image]):
     def fingerprint(self) -> str:
         """See `PoseSource.fingerprint`: also of the bodies, and of the kind and the sizes of images."""
         bodies = sorted(body.hash for body in self._models)
-        made_of = f"{super().fingerprint} {bodies} {self.kind} {self._sizes}"
+        # A file that was cut off and is copied again has another size.
+        sizes = [self._sizes[entry.name] for split in SPLITS for entry in self._parts[split]]
+        made_of = f"{super().fingerprint} {bodies} {self.kind} {sizes}"
         return hashlib.sha256(made_of.encode()).hexdigest()[:16]
 
     def check(self) -> None:
@@ -95,33 +97,22 @@ class FilmedSource(SurrealSource, Generic[Image]):
         return {name: value for name, value in self.__dict__.items() if name not in ("_bodies", "_sample")}
 
     def _is_usable(self, entry: ClipEntry) -> bool:
-        return super()._is_usable(entry) and not self._missing(entry)
-
-    def _missing(self, entry: ClipEntry) -> list[Path]:
-        return [file for file in self._files_of(entry) if not file.is_file()]
-
-    def _files_of(self, entry: ClipEntry) -> list[Path]:
-        return [self.tree / f"{entry.name}{end}" for end in self.files]
+        return super()._is_usable(entry) and None not in self._sizes[entry.name]
 
     @cached_property
-    def _parts(self) -> dict[str, list[ClipEntry]]:
+    def _sizes(self) -> dict[str, list[int | None]]:
+        """Of each clip that may have a part the sizes of its files, bytes; None of one that is missing."""
         usable = [entry for entry in self.entries if SurrealSource._is_usable(self, entry)]
-        if lacking := [missing for entry in usable for missing in self._missing(entry)[:1]]:
+        sizes = {
+            entry.name: [_size(self.tree / f"{entry.name}{end}") for end in self.files] for entry in usable
+        }
+        if lacking := [(name, each.index(None)) for name, each in sizes.items() if None in each]:
+            name, which = lacking[0]
             _LOG.warning(
                 "left out: %d of %d clips, which have not all of %s; the first: there is no %s",
-                len(lacking), len(usable), self._named_files, lacking[0],
+                len(lacking), len(usable), self._named_files, self.tree / f"{name}{self.files[which]}",
             )  # fmt: skip
-        return super()._parts
-
-    @cached_property
-    def _sizes(self) -> str:
-        """Hash of the sizes of all files, which those have changed that were cut off and are copied again."""
-        digest = hashlib.sha256()
-        for split in SPLITS:
-            for entry in self._parts[split]:
-                sizes = [file.stat().st_size for file in self._files_of(entry)]
-                digest.update(f"{split} {entry.name} {sizes}\n".encode())
-        return digest.hexdigest()[:16]
+        return sizes
 
     @cached_property
     def _sample(self) -> list[tuple[FilmedClip, int, Image]]:
@@ -211,3 +202,7 @@ class FilmedSource(SurrealSource, Generic[Image]):
         )
         scene = Scene(pose, betas, gender, torch.from_numpy(np.stack(joints)), [CAMERA] * len(rows), [])
         return scene, images
+
+
+def _size(path: Path) -> int | None:
+    return path.stat().st_size if path.is_file() else None

@@ -88,7 +88,10 @@ def find_tree(path: Path | None, run: str) -> Path:
             return tree
     for place in _PLACES:
         if parts := [split for split in SPLITS if (path / place / split).is_dir()]:
-            runs = sorted({entry.name for part in parts for entry in (path / place / part).iterdir()})[:5]
+            folders = [
+                folder for part in parts for folder in (path / place / part).iterdir() if folder.is_dir()
+            ]
+            runs = sorted({folder.name for folder in folders})[:5]
             raise FileNotFoundError(
                 f"data.source.run: expected {run} in {path / place}/{{{','.join(parts)}}}, which have "
                 f"{', '.join(runs) or 'nothing'}; choose one of them with data.source.run"

@@ -247,7 +247,8 @@ def test_a_missing_tree_is_named_with_what_was_expected(tmp_path, tree, caplog):
             SurrealSource(path).check()
     with pytest.raises(FileNotFoundError, match=r"no cmu/\{train,val,test\}/run0/SEQUENCE"):
         SurrealSource(tmp_path).check()
-    with pytest.raises(FileNotFoundError, match=r"run: expected run3 .*which have run0"):
+    (tree / "cmu" / "train" / ".DS_Store").touch()
+    with pytest.raises(FileNotFoundError, match=r"run: expected run3 .*which have run0;"):
         SurrealSource(tree, run="run3").check()
     (tmp_path / "cmu" / "test" / "run0").mkdir(parents=True)
     with pytest.raises(ValueError, match=r"no file .*is the download complete"):
