@@ -29,9 +29,8 @@ def examine_clips(
     loaded body against its 3D joints, mean and largest, mm; and these joints through the camera against the 2D joints,
     pixels.
     """
-    chosen = readable = [entry for entry in entries if not entry.problem]
-    if num_clips is not None:
-        chosen = [readable[i] for i in np.unique(np.linspace(0, len(readable) - 1, num_clips).astype(int))]
+    readable = [entry for entry in entries if not entry.problem]
+    chosen = from_all_over(readable, num_clips)
     posed = ClipBodies(bodies)
     num_damaged = 0
     camera_px: list[float] = []
@@ -68,6 +67,13 @@ def examine_clips(
         yield _of_camera(max(camera_px))
     else:
         yield Finding("no clip can be compared: none has all of pose, joints and camera", {}, is_wrong=True)
+
+
+def from_all_over(entries: Sequence[ClipEntry], number: int | None) -> list[ClipEntry]:
+    """So many of the entries, at equal distances, or all."""
+    if number is None:
+        return list(entries)
+    return [entries[i] for i in np.unique(np.linspace(0, len(entries) - 1, number).astype(int))]
 
 
 def beyond_rounding_px(clip: FilmedClip, frames: np.ndarray, joints: np.ndarray) -> float:

@@ -3,7 +3,7 @@
 import hashlib
 import logging
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar, Generic, TypeVar
@@ -14,11 +14,13 @@ import torch
 from datamodules.scenes import Scene
 from datamodules.sources import SPLITS, PoseRecords
 from datamodules.sources.surreal.bodies import ClipBodies
+from datamodules.sources.surreal.check import from_all_over
 from datamodules.sources.surreal.files import INFO, SEGMENTATION, FilmedClip, read_filmed_clip, read_images
 from datamodules.sources.surreal.index import ClipEntry
 from datamodules.sources.surreal.source import SurrealSource
 from datamodules.sources.surreal.world import CAMERA, to_camera, turned_pose
-from ljn.body import load_body_models
+from ljn.body import BodyModel, load_body_models
+from ljn.data import Finding
 
 _LOG = logging.getLogger(__name__)
 _NUM_MEASURED = 40  # clips, of each a frame, that say what kind of images and whose bodies the tree has
@@ -85,6 +87,19 @@ class FilmedSource(SurrealSource, Generic[Image]):
         super().check()
         _ = self.kind, self.is_of_bodies
 
+    def examine(self, bodies: Sequence[BodyModel], num_clips: int | None) -> Iterator[Finding]:
+        """See `Examinable`; first, how many frames have images that can be used. Damaged files are in the log."""
+        usable = [entry for entry in self.entries if self._is_usable(entry)]
+        chosen = from_all_over(usable, num_clips)
+        number = sum(len(entry.good_frames) for entry in chosen)
+        num_seen = sum(len(self._seen(entry, entry.good_frames)[1]) for entry in chosen)
+        yield Finding(
+            f"images: {num_seen} of {number} frames of {len(chosen)} of {len(usable)} clips can be used; others are "
+            f"damaged, or show less than {_LEAST_PIXELS} pixels of a body",
+            {"unusable_images": float(number - num_seen)},
+        )
+        yield from super().examine(bodies, num_clips)
+
     @cached_property
     def _models(self) -> Any:
         return load_body_models(self.body_path, self.genders)
@@ -119,10 +134,8 @@ class FilmedSource(SurrealSource, Generic[Image]):
         """Clips from all over the tree, of each a frame and its image."""
         entries = self._parts["test"] or self._parts["train"]
         sample = []
-        for i in np.unique(np.linspace(0, len(entries) - 1, _NUM_MEASURED).astype(int)):
-            clip, seen = self._seen(
-                entries[i], entries[i].good_frames[len(entries[i].good_frames) // 2 :][:1]
-            )
+        for entry in from_all_over(entries, _NUM_MEASURED):
+            clip, seen = self._seen(entry, entry.good_frames[len(entry.good_frames) // 2 :][:1])
             sample += [(clip, frame, image) for frame, image in seen if clip is not None]
         if not sample:
             raise ValueError(

@@ -178,7 +178,7 @@ def test_shapes_of_other_bodies_are_fitted_to_the_joints(posed, surreal_bodies, 
     assert np.abs(clip.betas).max() < 4
 
 
-def test_frames_whose_images_are_damaged_or_empty_are_left_out(tmp_path, caplog):
+def test_frames_whose_images_are_damaged_or_empty_are_left_out(tmp_path, caplog, surreal_bodies):
     for number in range(1, 5):
         write_clip(tmp_path, "test", "01_01", number, images=number < 3, seed=number, num_frames=6)
     first, second, third = (str(clip_path(tmp_path, "test", "01_01", number)) for number in (1, 2, 3))
@@ -193,6 +193,8 @@ def test_frames_whose_images_are_damaged_or_empty_are_left_out(tmp_path, caplog)
     assert set(records.sequence) == {"test/run0/01_01/01_01_c0001"}
     assert "01_01_c0002_depth.mat: " in caplog.text
     assert "6 of 9 samples of test come twice" in caplog.text
+    images, *_ = findings(source, surreal_bodies)
+    assert images.text.startswith("images: 6 of 18 frames of 3 of 3 clips can be used")
     fingerprint = source.fingerprint
     depth.write_bytes(Path(f"{first}_depth.mat").read_bytes())
     again = SurrealDepthSource(tmp_path, radial=True)
