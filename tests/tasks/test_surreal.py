@@ -49,7 +49,8 @@ def test_the_check_prints_a_line_for_each_clip_and_what_they_say_together(
     assert metrics["check/body_mm"] < 0.01
     lines = capsys.readouterr().out.splitlines()
     assert [line.split(":")[0] for line in lines] == [
-        "train/run0/01_01/01_01_c0001", "test/run0/03_01/03_01_c0001", "2 clips, 0 of them damaged", "bodies", "camera",
+        "train/run0/01_01/01_01_c0001", "test/run0/03_01/03_01_c0001",
+        "2 of 2 clips, 0 of them damaged; 0 other files cannot be read", "bodies", "camera",
     ]  # fmt: skip
     with pytest.raises(ValueError, match=r"task\.num_clips: expected 1 or more, or null for all, got 0"):
         check(smoke_config(tmp_path, "task=check", *chosen(tree), "task.num_clips=0"))

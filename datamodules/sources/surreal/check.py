@@ -14,6 +14,7 @@ from ljn.data import Finding
 
 _ROUNDING_PX = 0.5
 _TOLERANCE_PX = 0.01
+_NEAR_M = 1.0  # from the camera's plane: nearer, the rounding of numbers of 32 bits shows
 _SAME_MM = 5.0
 
 
@@ -22,14 +23,14 @@ def examine_clips(
 ) -> Iterator[Finding]:
     """A line for each of so many clips from all over the tree, or of all, and what they say together.
 
-    Two checks, each at its own place. `camera`: the file's 3D joints through SURREAL's camera against its 2D joints, no
-    body taking part: by how much they differ beyond the rounding to whole pixels, the largest over frames and joints.
-    `body`: the file's pose and shape through the loaded body against its 3D joints, mean and largest, mm; and these
-    joints through the camera against the 2D joints, pixels.
+    Files of which the index says that they cannot be read are counted. Two checks, each at its own place. `camera`: the
+    file's 3D joints through SURREAL's camera against its 2D joints, no body taking part: by how much they differ beyond
+    the rounding to whole pixels, the largest over frames and joints. `body`: the file's pose and shape through the
+    loaded body against its 3D joints, mean and largest, mm; and these joints through the camera against the 2D joints,
+    pixels.
     """
-    chosen = entries
-    if num_clips is not None:
-        chosen = [entries[i] for i in np.unique(np.linspace(0, len(entries) - 1, num_clips).astype(int))]
+    readable = [entry for entry in entries if not entry.problem]
+    chosen = from_all_over(readable, num_clips)
     posed = ClipBodies(bodies)
     num_damaged = 0
     camera_px: list[float] = []
@@ -55,7 +56,12 @@ def examine_clips(
             f"{errors.max():.1f} mm, {body_px:.2f} px",
             {"camera_px": camera_px[-1], "body_mm": float(errors.max()), "body_px": body_px},
         )
-    yield Finding(f"{len(chosen)} clips, {num_damaged} of them damaged", {"damaged": float(num_damaged)})
+    num_unreadable = len(entries) - len(readable)
+    yield Finding(
+        f"{len(chosen)} of {len(readable)} clips, {num_damaged} of them damaged; {num_unreadable} other files cannot "
+        "be read",
+        {"damaged": float(num_damaged + num_unreadable)},
+    )
     if camera_px:
         yield _of_bodies(body_mm, bodies)
         yield _of_camera(max(camera_px))
@@ -63,14 +69,25 @@ def examine_clips(
         yield Finding("no clip can be compared: none has all of pose, joints and camera", {}, is_wrong=True)
 
 
+def from_all_over(entries: Sequence[ClipEntry], number: int | None) -> list[ClipEntry]:
+    """So many of the entries, at equal distances, or all."""
+    if number is None:
+        return list(entries)
+    return [entries[i] for i in np.unique(np.linspace(0, len(entries) - 1, number).astype(int))]
+
+
 def beyond_rounding_px(clip: FilmedClip, frames: np.ndarray, joints: np.ndarray) -> float:
     """The largest distance along u or v between joints `(n, 24, 3)` in the image and the file's, less that of rounding.
 
-    Joints are in SURREAL's world, metres. Infinite where one lies behind the camera.
+    Joints are in SURREAL's world, metres; people walk past its camera. Those within 1 m of the camera's plane are not
+    compared; infinite if that is all of them.
     """
-    seen = to_pixels(to_mirrored_camera(joints, clip.camera_place))
-    error = np.abs(seen - clip.pixels[frames]).max(initial=0.0) - _ROUNDING_PX
-    return float(max(0.0, error)) if np.isfinite(error) else float("inf")
+    seen = to_mirrored_camera(joints, clip.camera_place)
+    is_compared = np.abs(seen[..., 2]) > _NEAR_M
+    if not is_compared.any():
+        return float("inf")
+    error = np.abs(to_pixels(seen[is_compared]) - clip.pixels[frames][is_compared]).max() - _ROUNDING_PX
+    return float(max(0.0, error))
 
 
 def _of_bodies(body_mm: Sequence[float], bodies: Sequence[BodyModel]) -> Finding:

@@ -3,7 +3,7 @@
 import hashlib
 import logging
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar, Generic, TypeVar
@@ -12,13 +12,15 @@ import numpy as np
 import torch
 
 from datamodules.scenes import Scene
-from datamodules.sources import PoseRecords
+from datamodules.sources import SPLITS, PoseRecords
 from datamodules.sources.surreal.bodies import ClipBodies
+from datamodules.sources.surreal.check import from_all_over
 from datamodules.sources.surreal.files import INFO, SEGMENTATION, FilmedClip, read_filmed_clip, read_images
 from datamodules.sources.surreal.index import ClipEntry
 from datamodules.sources.surreal.source import SurrealSource
 from datamodules.sources.surreal.world import CAMERA, to_camera, turned_pose
-from ljn.body import load_body_models
+from ljn.body import BodyModel, load_body_models
+from ljn.data import Finding
 
 _LOG = logging.getLogger(__name__)
 _NUM_MEASURED = 40  # clips, of each a frame, that say what kind of images and whose bodies the tree has
@@ -73,15 +75,30 @@ class FilmedSource(SurrealSource, Generic[Image]):
 
     @property
     def fingerprint(self) -> str:
-        """See `PoseSource.fingerprint`: also of the bodies, and of the kind of images."""
+        """See `PoseSource.fingerprint`: also of the bodies, and of the kind and the sizes of images."""
         bodies = sorted(body.hash for body in self._models)
-        made_of = f"{super().fingerprint} {bodies} {self.kind}"
+        # A file that was cut off and is copied again has another size.
+        sizes = [self._sizes[entry.name] for split in SPLITS for entry in self._parts[split]]
+        made_of = f"{super().fingerprint} {bodies} {self.kind} {sizes}"
         return hashlib.sha256(made_of.encode()).hexdigest()[:16]
 
     def check(self) -> None:
         """Read the index, or make it, and find out what kind of images and whose bodies there are."""
         super().check()
         _ = self.kind, self.is_of_bodies
+
+    def examine(self, bodies: Sequence[BodyModel], num_clips: int | None) -> Iterator[Finding]:
+        """See `Examinable`; first, how many frames have images that can be used. Damaged files are in the log."""
+        usable = [entry for entry in self.entries if self._is_usable(entry)]
+        chosen = from_all_over(usable, num_clips)
+        number = sum(len(entry.good_frames) for entry in chosen)
+        num_seen = sum(len(self._seen(entry, entry.good_frames)[1]) for entry in chosen)
+        yield Finding(
+            f"images: {num_seen} of {number} frames of {len(chosen)} of {len(usable)} clips can be used; others are "
+            f"damaged, or show less than {_LEAST_PIXELS} pixels of a body",
+            {"unusable_images": float(number - num_seen)},
+        )
+        yield from super().examine(bodies, num_clips)
 
     @cached_property
     def _models(self) -> Any:
@@ -95,19 +112,30 @@ class FilmedSource(SurrealSource, Generic[Image]):
         return {name: value for name, value in self.__dict__.items() if name not in ("_bodies", "_sample")}
 
     def _is_usable(self, entry: ClipEntry) -> bool:
-        return super()._is_usable(entry) and all(
-            (self.tree / f"{entry.name}{end}").is_file() for end in self.files
-        )
+        return super()._is_usable(entry) and None not in self._sizes[entry.name]
+
+    @cached_property
+    def _sizes(self) -> dict[str, list[int | None]]:
+        """Of each clip that may have a part the sizes of its files, bytes; None of one that is missing."""
+        usable = [entry for entry in self.entries if SurrealSource._is_usable(self, entry)]
+        sizes = {
+            entry.name: [_size(self.tree / f"{entry.name}{end}") for end in self.files] for entry in usable
+        }
+        if lacking := [(name, each.index(None)) for name, each in sizes.items() if None in each]:
+            name, which = lacking[0]
+            _LOG.warning(
+                "left out: %d of %d clips, which have not all of %s; the first: there is no %s",
+                len(lacking), len(usable), self._named_files, self.tree / f"{name}{self.files[which]}",
+            )  # fmt: skip
+        return sizes
 
     @cached_property
     def _sample(self) -> list[tuple[FilmedClip, int, Image]]:
         """Clips from all over the tree, of each a frame and its image."""
         entries = self._parts["test"] or self._parts["train"]
         sample = []
-        for i in np.unique(np.linspace(0, len(entries) - 1, _NUM_MEASURED).astype(int)):
-            clip, seen = self._seen(
-                entries[i], entries[i].good_frames[len(entries[i].good_frames) // 2 :][:1]
-            )
+        for entry in from_all_over(entries, _NUM_MEASURED):
+            clip, seen = self._seen(entry, entry.good_frames[len(entry.good_frames) // 2 :][:1])
             sample += [(clip, frame, image) for frame, image in seen if clip is not None]
         if not sample:
             raise ValueError(
@@ -187,3 +215,7 @@ class FilmedSource(SurrealSource, Generic[Image]):
         )
         scene = Scene(pose, betas, gender, torch.from_numpy(np.stack(joints)), [CAMERA] * len(rows), [])
         return scene, images
+
+
+def _size(path: Path) -> int | None:
+    return path.stat().st_size if path.is_file() else None

@@ -1,6 +1,7 @@
 """What clips a SURREAL tree has, read once: a line for each file, appended as it is read, in a small file of the cache.
 
-Cut off, the next call goes on from the last whole line; a file that has changed since is read again.
+Cut off, the next call goes on from the last whole line; a file that has changed since, or could not be read, is read
+again.
 """
 
 import hashlib
@@ -87,7 +88,10 @@ def find_tree(path: Path | None, run: str) -> Path:
             return tree
     for place in _PLACES:
         if parts := [split for split in SPLITS if (path / place / split).is_dir()]:
-            runs = sorted({entry.name for part in parts for entry in (path / place / part).iterdir()})[:5]
+            folders = [
+                folder for part in parts for folder in (path / place / part).iterdir() if folder.is_dir()
+            ]
+            runs = sorted({folder.name for folder in folders})[:5]
             raise FileNotFoundError(
                 f"data.source.run: expected {run} in {path / place}/{{{','.join(parts)}}}, which have "
                 f"{', '.join(runs) or 'nothing'}; choose one of them with data.source.run"
@@ -107,6 +111,8 @@ def read_index(tree: Path, run: str, cache_dir: Path | None) -> list[ClipEntry]:
         path = cache_dir / f"surreal-{place}.jsonl"
         path.parent.mkdir(parents=True, exist_ok=True)
     known = dict(_lines(path))
+    # Whether a file can be read hangs on more than its size and time: on permissions, a link's target, a lent disk.
+    usable = {file for file, entry in known.items() if not entry.problem}
     files = [
         (f"{split}/{run}/{name}", size, time)
         for split in SPLITS
@@ -114,12 +120,13 @@ def read_index(tree: Path, run: str, cache_dir: Path | None) -> list[ClipEntry]:
     ]
     if not files:
         raise ValueError(f"data.source.path: no file *{INFO} in {tree}/*/{run}; is the download complete?")
-    if missing := [file for file in files if file not in known]:
+    if missing := [file for file in files if file not in usable]:
         with open(path or os.devnull, "ab", buffering=0) as log:
             log.write(b"\n")  # ends a line that was cut off
             for file in tqdm(missing, desc=f"index of {tree.name}", unit="clip", disable=None, leave=False):
-                known[file] = _entry(tree, file[0])
-                log.write(f"{json.dumps([*file, *known[file][1:]])}\n".encode())
+                if (entry := _entry(tree, file[0])) != known.get(file):
+                    known[file] = entry
+                    log.write(f"{json.dumps([*file, *entry[1:]])}\n".encode())
     entries = [known[file] for file in files]
     _report(entries, "the index" if path is None else str(path))
     return entries
@@ -148,21 +155,39 @@ def _report(entries: list[ClipEntry], place: str) -> None:
 
 
 def _walk(folder: Path) -> Iterator[tuple[str, int, int]]:
-    """Of each clip below a run's folder its path there, without the ending, and its file's size and time; ordered."""
+    """Of each clip below a run's folder its path there, without the ending, and its file's size and time; ordered.
+
+    Hidden files are none of SURREAL's: `._01_01_c0001_info.mat` of a Mac is of that form. For a folder that cannot be
+    listed stands a clip by the name of `*`, which cannot be read either.
+    """
     if not folder.is_dir():
         return
-    for sequence in sorted(each.name for each in os.scandir(folder) if each.is_dir()):
-        clips = sorted(
-            (each.name, each) for each in os.scandir(folder / sequence) if each.name.endswith(INFO)
-        )
-        for name, file in clips:
-            stamp = file.stat()
-            yield f"{sequence}/{name.removesuffix(INFO)}", stamp.st_size, stamp.st_mtime_ns
+    for sequence in sorted(os.listdir(folder)):
+        if sequence.startswith(".") or not os.path.isdir(folder / sequence):
+            continue
+        try:
+            names = sorted(os.listdir(folder / sequence))
+        except OSError:
+            names = [f"*{INFO}"]
+        for name in names:
+            if name.endswith(INFO) and not name.startswith("."):
+                yield f"{sequence}/{name.removesuffix(INFO)}", *_stamp(folder / sequence / name)
+
+
+def _stamp(path: Path) -> tuple[int, int]:
+    try:
+        stamp = path.stat()
+    except OSError:  # which reading it will say
+        return 0, 0
+    return stamp.st_size, stamp.st_mtime_ns
 
 
 def _entry(tree: Path, name: str) -> ClipEntry:
+    path = tree / f"{name}{INFO}"
     try:
-        clip = read_clip(tree / f"{name}{INFO}")
+        if path.exists() and not path.is_file():  # a pipe would be waited for
+            raise ValueError(f"{path}: expected a file, got a folder, or a pipe, or a device")
+        clip = read_clip(path)
     except (ValueError, OSError) as error:
         return ClipEntry(name, problem=reason(error, 400))
     return ClipEntry(name, len(clip), tuple(np.flatnonzero(~clip.is_good).tolist()), _content(clip))

@@ -19,7 +19,7 @@ from ljn.reading import READ_ERRORS, brief, reason, shown
 
 _HDF5 = b"\x89HDF\r\n\x1a\n"
 _HDF5_PLACES = (512, 0)  # MATLAB writes a block of text of its own before it, others may not
-_MAX_VALUES = 2**26
+_MAX_VALUES = 2**22  # a clip of 100 frames has 7,200 joint angles, an image 76,800 pixels
 _MAX_CELLS_IN_CELLS = 3
 
 # Of versions 5 to 7 ("MAT-File Format", The MathWorks).
@@ -75,11 +75,16 @@ def _read_older(file: IO[bytes], names: Collection[str]) -> dict[str, np.ndarray
     header = file.read(_HEADER)
     order = {b"IM": "<", b"MI": ">"}.get(header[126:128], "")
     if not order or header[125 if order == "<" else 124] != 1:
-        raise ValueError("it does not begin as one")
+        is_page = header.lstrip().startswith(b"<")
+        raise ValueError(
+            "it is a web page" if is_page else "it does not begin as one" if header else "it is empty"
+        )
     found, place = {}, _HEADER
     while place < size:
         file.seek(place)
         element = _element(file.read(8), 0, order)
+        if element.kind not in (_MATRIX, _COMPRESSED):  # zeros, where a download was not finished
+            raise ValueError(f"a piece of kind {element.kind}, where an array was expected")
         start, stop = place + element.start, place + element.start + element.size
         if stop > size:
             raise ValueError(f"it is cut off: {size} bytes, expected {stop}")
@@ -89,7 +94,7 @@ def _read_older(file: IO[bytes], names: Collection[str]) -> dict[str, np.ndarray
             if matrix.name in names:
                 file.seek(start)
                 found[matrix.name] = _array(_inflate(file.read(element.size), order), matrix.name, order)
-        elif element.kind == _MATRIX:
+        else:
             name = _name(file.read(min(element.size, _HEAD)), order)
             if name in names:
                 file.seek(start)
@@ -180,7 +185,7 @@ def _read_hdf5(path: Path, names: Collection[str]) -> dict[str, np.ndarray]:
             raise ValueError(f"{brief(name)} lies in another file")
         if math.prod(node.shape or ()) > _MAX_VALUES:
             raise ValueError(f"{brief(name)} has the dimensions {shown(node.shape)}")
-        if "MATLAB_empty" in node.attrs:
+        if "MATLAB_empty" in node.attrs or node.shape is None:
             return np.zeros((0, 0))
         if h5py.check_ref_dtype(node.dtype) is not None:
             cells = np.ravel(node[()])

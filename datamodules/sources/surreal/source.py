@@ -126,11 +126,25 @@ class SurrealSource:
                 f"more, all of its files ({self._named_files}), and a subject that is not skipped "
                 "(data.source.skip)"
             )
+        for split in SPLITS:
+            if not parts[split]:
+                _LOG.warning("SURREAL: %s", self._nothing_for(split))
         return parts
 
     @property
     def _named_files(self) -> str:
         return ", ".join(f"*{end}" for end in self.files)
+
+    def _nothing_for(self, split: str) -> str:
+        """Why a split has no clip."""
+        folders = [self.tree / part / self.run for part in (("val", "test") if split == "val" else (split,))]
+        names = " or ".join(map(str, folders))
+        if not any(folder.is_dir() for folder in folders):
+            return f"no clip for '{split}': there is no {names}; download this part of SURREAL, too"
+        return (
+            f"no usable clip for '{split}' in {names}: all are too short, damaged, skipped, of subjects of the test "
+            f"set, or not whole ({self._named_files})"
+        )
 
     def _is_usable(self, entry: ClipEntry) -> bool:
         is_skipped = entry.subject in self.skip or entry.sequence in self.skip
@@ -139,9 +153,7 @@ class SurrealSource:
 
     def examine(self, bodies: Sequence[BodyModel], num_clips: int | None) -> Iterator[Finding]:
         """See `Examinable`: cameras and bodies, of clips of all splits."""
-        yield from examine_clips(
-            self.tree, [entry for entry in self.entries if not entry.problem], bodies, num_clips
-        )
+        yield from examine_clips(self.tree, self.entries, bodies, num_clips)
 
     def motion(self, split: str) -> dict[str, int]:
         """See `PoseSource.motion`: also subjects and sequences, and the files of the split that cannot be read."""
@@ -184,9 +196,11 @@ class SurrealSource:
         path = self.tree / f"{entry.name}{INFO}"
         try:
             clip = read_clip(path)
-        except (ValueError, FileNotFoundError) as error:
+            if len(clip) != entry.num_frames:
+                raise ValueError(f"{path}: {len(clip)} frames, expected {entry.num_frames}")
+        except (ValueError, OSError) as error:
             raise ValueError(
-                f"{error} (it could be read when the tree was indexed: has it changed?)"
+                f"{error} (it was otherwise when the tree was indexed: has it changed?)"
             ) from error
         sequence = np.full(len(frames), entry.name)
         return clip.pose[frames], clip.betas[frames], clip.gender[frames], sequence, frames
@@ -199,10 +213,7 @@ class SurrealSource:
             raise ValueError(f"split: expected one of {', '.join(SPLITS)}, got '{split}'")
         clips = self._parts[split]
         if not clips:
-            raise ValueError(
-                f"data.source.path: no usable clip for '{split}' in {self.tree}/{split}/{self.run}: all are too short, "
-                f"damaged, skipped, of subjects of the test set, or not whole ({self._named_files})"
-            )
+            raise ValueError(f"data.source.path: {self._nothing_for(split)}")
         number = min(len(clips), max(1, num_records // self.samples_per_clip))
         chosen = np.sort(rng.permutation(len(clips))[:number])
         frames = [clips[i].good_frames for i in chosen]

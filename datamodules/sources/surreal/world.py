@@ -41,11 +41,11 @@ def to_camera(points: np.ndarray, camera_place: np.ndarray) -> np.ndarray:
 def to_pixels(points: np.ndarray) -> np.ndarray:
     """Where points `(..., 3)` in `to_mirrored_camera` lie in an image as it stands in the file, `(..., 2)` u and v.
 
-    Of a point in the camera's plane, or behind it, infinity or NaN.
+    Of a point in the camera's plane, infinity or NaN; of one behind it, as in `joints2D`, where the line through it and
+    the camera meets the image plane.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
-        ahead = np.where(points[..., 2:] > 0, points[..., 2:], np.nan)
-        return points[..., :2] / ahead * _FOCAL_PX + [_WIDTH / 2, _HEIGHT / 2]
+        return points[..., :2] / points[..., 2:] * _FOCAL_PX + [_WIDTH / 2, _HEIGHT / 2]
 
 
 def turned_pose(pose: np.ndarray, zrot: np.ndarray) -> np.ndarray:

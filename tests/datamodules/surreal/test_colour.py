@@ -17,6 +17,7 @@ from ljn.body.skeleton import JOINT_INDEX, MIRROR
 from ljn.cloud.rgb import RgbRecipe, crop_rgb
 from ljn.geometry.camera import project
 from ljn.geometry.rotations import body_to_camera
+from tests.datamodules.surreal.conftest import write_plain
 from tests.datamodules.surreal.writer import (
     MARKERS,
     clip_path,
@@ -272,7 +273,9 @@ def test_clips_without_a_whole_video_or_a_body_are_left_out_and_named(tmp_path, 
         records = SurrealRgbSource(tmp_path).records("test", 9, 0)
     assert set(records.sequence) == {"test/run0/01_01/01_01_c0001"}
     assert "01_01_c0002.mp4: cannot be used as a clip's video (expected the 6 frames" in caplog.text
-    assert "c0004" not in caplog.text
+    assert "left out: 1 of 4 clips, which have not all of *_info.mat, *.mp4, *_segm.mat" in caplog.text
+    assert "01_01_c0004.mp4" in caplog.text
+    write_plain(tmp_path, "train", "02_01")
     with pytest.raises(
         ValueError, match=r"no usable clip for 'train' .* \(\*_info\.mat, \*\.mp4, \*_segm\.mat\)"
     ):

@@ -14,7 +14,14 @@ from ljn.body import SMPL
 from ljn.geometry.camera import project
 from ljn.geometry.rotations import body_to_camera
 from ljn.render import get_renderer
-from tests.datamodules.surreal.writer import clip_path, make_clip, make_images, write_clip, write_mat
+from tests.datamodules.surreal.writer import (
+    clip_path,
+    make_clip,
+    make_images,
+    projection,
+    write_clip,
+    write_mat,
+)
 
 
 @pytest.fixture(autouse=True)
@@ -65,6 +72,18 @@ def test_another_body_and_another_camera_are_told_apart(tmp_path, surreal_bodies
         assert "beyond rounding from joints2D, expected 0" in camera.text
 
 
+def test_who_walks_past_the_camera_is_no_error_of_it(tmp_path, surreal_bodies):
+    fields, _ = make_clip(num_frames=40)
+    place = fields["camLoc"].ravel().astype(float)
+    fields["joints3D"][0] += np.linspace(0, 12, 40)  # from six metres before it to six behind
+    joints = fields["joints3D"].transpose(2, 1, 0).astype(float)
+    seen = np.concatenate([joints, np.ones((40, 24, 1))], -1) @ projection(place).T
+    fields["joints2D"] = np.round(seen[..., :2] / seen[..., 2:]).transpose(2, 1, 0)
+    write_mat(Path(f"{clip_path(tmp_path, 'test', '01_01')}_info.mat"), fields)
+    *_, camera = findings(SurrealSource(tmp_path), surreal_bodies)
+    assert "0 px beyond rounding: all is well" in camera.text
+
+
 def test_damaged_clips_are_named_and_the_check_goes_on(tmp_path, surreal_bodies):
     for number in (1, 2, 3):
         write_clip(tmp_path, "test", "01_01", number, num_frames=6)
@@ -72,11 +91,12 @@ def test_damaged_clips_are_named_and_the_check_goes_on(tmp_path, surreal_bodies)
     del fields["joints3D"]
     write_mat(Path(f"{clip_path(tmp_path, 'test', '01_01', 2)}_info.mat"), fields)
     write_clip(tmp_path, "test", "01_01", 3, num_frames=6, fields={"joints3D": np.full((3, 24, 6), np.nan)})
+    Path(f"{clip_path(tmp_path, 'test', '01_01', 4)}_info.mat").write_bytes(b"")
     found = findings(SurrealSource(tmp_path), surreal_bodies)
     text = "\n".join(each.text for each in found)
     assert "01_01_c0002_info.mat: no field joints3D" in text
     assert "c0003_info.mat: no frame of 6 is whole" in text
-    assert "3 clips, 2 of them damaged" in text
+    assert "3 of 3 clips, 2 of them damaged; 1 other files cannot be read" in text
     assert not found[-1].is_wrong
     write_mat(Path(f"{clip_path(tmp_path, 'test', '01_01')}_info.mat"), fields)
     assert findings(SurrealSource(tmp_path), surreal_bodies)[-1].is_wrong
@@ -158,7 +178,7 @@ def test_shapes_of_other_bodies_are_fitted_to_the_joints(posed, surreal_bodies, 
     assert np.abs(clip.betas).max() < 4
 
 
-def test_frames_whose_images_are_damaged_or_empty_are_left_out(tmp_path, caplog):
+def test_frames_whose_images_are_damaged_or_empty_are_left_out(tmp_path, caplog, surreal_bodies):
     for number in range(1, 5):
         write_clip(tmp_path, "test", "01_01", number, images=number < 3, seed=number, num_frames=6)
     first, second, third = (str(clip_path(tmp_path, "test", "01_01", number)) for number in (1, 2, 3))
@@ -173,6 +193,18 @@ def test_frames_whose_images_are_damaged_or_empty_are_left_out(tmp_path, caplog)
     assert set(records.sequence) == {"test/run0/01_01/01_01_c0001"}
     assert "01_01_c0002_depth.mat: " in caplog.text
     assert "6 of 9 samples of test come twice" in caplog.text
-    depth.with_name("01_01_c0001_depth.mat").write_bytes(b"")
+    images, *_ = findings(source, surreal_bodies)
+    assert images.text.startswith("images: 6 of 18 frames of 3 of 3 clips can be used")
+    fingerprint = source.fingerprint
+    depth.write_bytes(Path(f"{first}_depth.mat").read_bytes())
+    again = SurrealDepthSource(tmp_path, radial=True)
+    assert again.fingerprint != fingerprint, "a file that was copied again is another"
+    with caplog.at_level(logging.WARNING):
+        SurrealDepthSource(tmp_path, radial=True).check()
+    assert "left out: 1 of 4 clips, which have not all of *_info.mat, *_depth.mat, *_segm.mat" in caplog.text
+    assert "there is no" in caplog.text
+    assert "01_01_c0004_depth.mat" in caplog.text
+    for number in (1, 2):
+        depth.with_name(f"01_01_c000{number}_depth.mat").write_bytes(b"")
     with pytest.raises(ValueError, match=r"no \*_depth\.mat in .* can be read, of 3 clips"):
         SurrealDepthSource(tmp_path).check()

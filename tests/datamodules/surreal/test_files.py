@@ -91,6 +91,9 @@ def test_a_truncated_and_a_renamed_file_are_called_damaged(tmp_path, h5py):
         path.write_bytes(content)
         with pytest.raises(ValueError, match=r"a_info\.mat: cannot be read as a MATLAB file"):
             read_clip(path)
+    path.write_bytes(b"\n<!DOCTYPE html><html>401 Unauthorized</html>")
+    with pytest.raises(ValueError, match="it is a web page"):
+        read_clip(path)
     with pytest.raises(FileNotFoundError):
         read_clip(tmp_path / "none.mat")
 
@@ -103,6 +106,23 @@ def test_links_into_other_files_are_not_followed(tmp_path, h5py):
         for name in ("pose", "shape", "gender"):
             file[name] = h5py.ExternalLink(str(tmp_path / "other.mat"), name)
     with pytest.raises(ValueError, match="pose is a link"):
+        read_clip(path)
+
+
+def test_a_field_of_hdf5_without_content_is_named(tmp_path, h5py):
+    write_mat73(tmp_path / "a_info.mat", plain_fields(), h5py)
+    with h5py.File(tmp_path / "a_info.mat", "r+") as file:
+        del file["gender"]
+        file["gender"] = h5py.Empty("f4")
+    with pytest.raises(ValueError, match=r"gender: expected .*, got"):
+        read_clip(tmp_path / "a_info.mat")
+
+
+def test_pieces_that_are_none_are_damage(tmp_path):
+    path = tmp_path / "a_info.mat"
+    write_mat(path, plain_fields())
+    path.write_bytes(path.read_bytes() + bytes(64))  # room for what has not come yet
+    with pytest.raises(ValueError, match="a piece of kind 0, where an array was expected"):
         read_clip(path)
 
 

@@ -166,6 +166,61 @@ def test_an_index_that_was_cut_off_is_gone_on_with_and_a_changed_file_is_read_ag
     assert read == [file.name]
 
 
+def test_strays_are_passed_over_or_named_and_what_becomes_readable_is_read(tmp_path, caplog):
+    for number in (1, 2):
+        write_plain(tmp_path, "train", "01_01", number)
+    folder = clip_path(tmp_path, "train", "01_01").parent
+    target = tmp_path / "elsewhere.mat"
+    (folder / "01_01_c0003_info.mat").symlink_to(target)
+    (folder / "01_01_c0004_info.mat").mkdir()
+    os.mkfifo(folder / "01_01_c0005_info.mat")
+    for name in ("._01_01_c0001_info.mat", ".DS_Store", "01_01_c0001_info copy.mat", "../.DS_Store"):
+        (folder / name).write_bytes(b"of another program")
+    (folder.parent / "self").symlink_to("self")
+
+    def problems():
+        source = SurrealSource(tmp_path)
+        source.cache_dir = tmp_path / "cache"
+        return {entry.name[-5:]: entry.problem for entry in source.entries}
+
+    found = problems()
+    assert [name for name, problem in found.items() if not problem] == ["c0001", "c0002"]
+    assert "01_01_c0003_info.mat" in found["c0003"]
+    assert all("expected a file, got a folder, or a pipe" in found[name] for name in ("c0004", "c0005"))
+    assert "3 of 5 files, and 0 frames of others, are left out" in caplog.text
+    [index] = (tmp_path / "cache").iterdir()
+    size = index.stat().st_size
+    assert problems() == found
+    assert index.stat().st_size < size + 10, "what is still wrong is not written again"
+    target.write_bytes((folder / "01_01_c0001_info.mat").read_bytes())
+    assert not problems()["c0003"]
+
+
+def test_a_folder_that_cannot_be_listed_is_named_and_the_rest_goes_on(tmp_path, monkeypatch):
+    for sequence in ("01_01", "02_01"):
+        write_plain(tmp_path, "train", sequence)
+    listed = os.listdir
+
+    def refused(path):
+        if Path(path).name == "02_01":
+            raise PermissionError(13, "Permission denied", str(path))
+        return listed(path)
+
+    monkeypatch.setattr(os, "listdir", refused)
+    first, second = SurrealSource(tmp_path).entries
+    assert not first.problem
+    assert "train/run0/02_01/*_info.mat" in second.problem
+
+
+def test_a_clip_that_is_exchanged_after_the_index_is_named(tmp_path):
+    write_plain(tmp_path, "train", "01_01", num_frames=9)
+    source = SurrealSource(tmp_path)
+    source.check()
+    write_plain(tmp_path, "train", "01_01", num_frames=6)
+    with pytest.raises(ValueError, match=r"01_01_c0001_info\.mat: 6 frames, expected 9 .*has it changed"):
+        source.records("train", 9, 0)
+
+
 def test_names_are_those_of_sequences_and_subjects():
     for folder, sequence, subject in (
         ("01_01", "1_1", "1"), ("ung_104_02", "104_2", "104"), ("143_21", "143_21", "143"), ("h36m", "h36m", "h36m"),
@@ -184,7 +239,7 @@ def test_what_is_damaged_is_named_and_counted(tree, caplog):
     assert "subjects 22 are in training and test" in caplog.text
 
 
-def test_a_missing_tree_is_named_with_what_was_expected(tmp_path, tree):
+def test_a_missing_tree_is_named_with_what_was_expected(tmp_path, tree, caplog):
     for path in (None, tmp_path / "none"):
         with pytest.raises(
             FileNotFoundError, match=r"path: expected the folder of SURREAL with cmu/.*registration"
@@ -192,7 +247,8 @@ def test_a_missing_tree_is_named_with_what_was_expected(tmp_path, tree):
             SurrealSource(path).check()
     with pytest.raises(FileNotFoundError, match=r"no cmu/\{train,val,test\}/run0/SEQUENCE"):
         SurrealSource(tmp_path).check()
-    with pytest.raises(FileNotFoundError, match=r"run: expected run3 .*which have run0"):
+    (tree / "cmu" / "train" / ".DS_Store").touch()
+    with pytest.raises(FileNotFoundError, match=r"run: expected run3 .*which have run0;"):
         SurrealSource(tree, run="run3").check()
     (tmp_path / "cmu" / "test" / "run0").mkdir(parents=True)
     with pytest.raises(ValueError, match=r"no file .*is the download complete"):
@@ -201,12 +257,18 @@ def test_a_missing_tree_is_named_with_what_was_expected(tmp_path, tree):
     with pytest.raises(ValueError, match=r"of 1 clips in .* none has 6 frames or more"):
         SurrealSource(tmp_path).check()
     write_plain(tmp_path, "test", "01_01", 2)
-    with pytest.raises(ValueError, match="no usable clip for 'train'"):
+    with caplog.at_level(logging.WARNING):
+        SurrealSource(tmp_path).check()
+    assert "no clip for 'train': there is no" in caplog.text
+    with pytest.raises(ValueError, match=r"'train': there is no .*cmu/train/run0; download this part"):
+        SurrealSource(tmp_path).records("train", 3, 0)
+    write_plain(tmp_path, "train", "18_01")
+    with pytest.raises(ValueError, match=r"no usable clip for 'train' in .* skipped"):
         SurrealSource(tmp_path).records("train", 3, 0)
     assert len(SurrealSource(tmp_path).records("val", 3, 0)) == 3, "of test, where there is no val"
-    for number in (1, 2):
-        write_plain(tmp_path, "test", "01_01", number, gender=4)
-    with pytest.raises(ValueError, match=r"none of 2 files can be read; the first: .*gender: expected 0"):
+    for split, sequence, number in (("train", "18_01", 1), ("test", "01_01", 1), ("test", "01_01", 2)):
+        write_plain(tmp_path, split, sequence, number, gender=4)
+    with pytest.raises(ValueError, match=r"none of 3 files can be read; the first: .*gender: expected 0"):
         SurrealSource(tmp_path).check()
 
 
