@@ -1,5 +1,6 @@
 """Reading a BVH file: a skeleton and its joints' angles, frame by frame."""
 
+import codecs
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -44,10 +45,7 @@ def read_bvh(path: Path) -> BvhFile:
     if (size := path.stat().st_size) > _MAX_BYTES:
         raise ValueError(f"{size} bytes, expected at most {_MAX_BYTES}")
     content = path.read_bytes()
-    try:
-        text = content.decode("utf-8-sig")
-    except UnicodeDecodeError:
-        text = content.decode("latin-1")
+    text = _decoded(content)
     text = text.replace("\r\n", "\n").replace("\r", "\n")
     parts = _MOTION.split(text)
     if len(parts) != 2:
@@ -55,6 +53,16 @@ def read_bvh(path: Path) -> BvhFile:
     names, parents, offsets, channels = _hierarchy(parts[0])
     frames, rate, notes = _motion(parts[1], sum(map(len, channels)))
     return BvhFile(names, parents, offsets, channels, frames, rate, notes)
+
+
+def _decoded(content: bytes) -> str:
+    is_wide = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    for encoding in ("utf-16" if is_wide else "utf-8-sig", "latin-1"):
+        try:
+            return content.decode(encoding)
+        except UnicodeDecodeError:
+            continue
+    raise AssertionError("latin-1 has every byte")
 
 
 def _statements(text: str) -> Iterator[tuple[int, list[str]]]:
@@ -85,7 +93,7 @@ def _hierarchy(
             parents.append(-1 if here is None else here)
             pending = len(names)
             names.append(" ".join(words[1:]))
-        elif keyword == "END":
+        elif keyword in ("END", "ENDSITE"):
             pending = None
         elif keyword == "{":
             open_joints.append(pending)
@@ -145,6 +153,9 @@ def _motion(text: str, width: int) -> tuple[np.ndarray, float | None, tuple[str,
     body = body.replace(",", " " if "." in body else ".")
     rows = [words for line in body.split("\n") if (words := line.split())]
     whole = [words for words in rows if len(words) == width]
+    if not whole and match[1].isdecimal() and sum(map(len, rows)) == int(match[1][:9]) * width:
+        words = [word for row in rows for word in row]  # lines that end within a frame
+        whole = rows = [words[start : start + width] for start in range(0, len(words), width)]
     if not whole:
         got = f"{len(rows)} lines, the first of {len(rows[0])} numbers" if rows else "none"
         raise ValueError(f"MOTION: expected lines of {width} numbers, got {got}")
