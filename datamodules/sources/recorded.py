@@ -17,6 +17,7 @@ from datamodules.sources.recordings import (
     find_motion_files,
     read_recordings,
     steps,
+    subject_of,
 )
 from datamodules.sources.shapes import Shapes, check_shapes, draw_shapes
 from datamodules.sources.subjects import Subjects, check_shares, read_splits, split_by_hash
@@ -94,6 +95,10 @@ class RecordedSource(ABC):
         """Whether a file with the suffix is to be read at all, by its name."""
         return True
 
+    def subject_of(self, file: Path, root: Path) -> str:
+        """Whose motion a file below the root is, where `read` does not say it; see `recordings.subject_of`."""
+        return subject_of(file, root)
+
     @property
     def reader_settings(self) -> str:
         """All that `read` depends on beside the file, as text."""
@@ -118,7 +123,9 @@ class RecordedSource(ABC):
         files = [file for file in find_motion_files(self.path, self.suffix) if self.is_motion(file)]
         if not files:
             raise FileNotFoundError(f"data.source.path: no {self.suffix} file of a motion in '{self.path}'")
-        return read_recordings(self.path, files, self.read, self.reader_settings, self.cache_dir)
+        return read_recordings(
+            self.path, files, self.read, self.reader_settings, self.cache_dir, self.subject_of
+        )
 
     @cached_property
     def _subjects(self) -> Subjects:
