@@ -148,6 +148,11 @@ class RecordedSource(ABC):
         }
         return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:16]
 
+    def people(self, split: str) -> list[tuple[str, str]]:
+        """See `datamodules.sources.mixed.Peopled`."""
+        parts = [subject.rpartition("/") for subject in self._subjects[split]]
+        return [(dataset.rpartition("/")[2], name.lstrip("0") or name) for dataset, _, name in parts]
+
     def rows(self, split: str) -> np.ndarray:
         """The frames of a split before any filter, rows of the table.
 

@@ -27,6 +27,7 @@ _MAX_RADIANS = 100.0  # no file turns a joint farther; a damaged number does
 _ARCHIVES = (".zip", ".7z", ".rar", ".tar", ".gz", ".bz2", ".xz", ".tgz")
 _FEW_NOTES = 3  # of a kind, each with its file; all of them are counted at the end
 _FEW_FILES = 50  # read without a progress bar
+_SUBJECT = re.compile(r"(?<![^\W_])subject[-_]?\d+", re.IGNORECASE)
 NO_GENDER = -1
 
 
@@ -104,7 +105,12 @@ def find_motion_files(path: Path, suffix: str) -> list[Path]:
 
 
 def subject_of(file: Path, root: Path) -> str:
-    """A file's subject by its place: its folder below the root; right in it, its name up to a `_`, `-` or blank."""
+    """A file's subject by its place: its folder below the root; right in it, its name up to a `_`, `-` or blank.
+
+    But `walk1_subject5` is of `subject5`, wherever it is.
+    """
+    if (match := _SUBJECT.search(file.stem)) is not None:
+        return match[0]
     folder = file.parent.relative_to(root.parent if root.is_file() else root).as_posix()
     if folder != ".":
         return folder
