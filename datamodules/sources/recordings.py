@@ -23,7 +23,9 @@ from ljn.reading import brief
 
 _LOG = logging.getLogger(__name__)
 _DECIMALS = 5  # of radians: as the embedded source's poses
-_MAX_RADIANS = 100.0  # no file turns a joint farther; a damaged number does
+_MAX_RADIANS = 100.0  # no file turns a body farther, round after round; a damaged number does
+_MAX_ANGLE = 4 * np.pi  # no file turns a joint farther
+_MAX_BETA = 20.0  # a person 20 standard deviations off spoils a training; fits of people reach 5, bad ones 10
 _ARCHIVES = (".zip", ".7z", ".rar", ".tar", ".gz", ".bz2", ".xz", ".tgz")
 _FEW_NOTES = 3  # of a kind, each with its file; all of them are counted at the end
 _FEW_FILES = 50  # read without a progress bar
@@ -232,12 +234,19 @@ def _checked(motion: Motion) -> tuple[Motion, tuple[np.ndarray, ...]]:
     if number == 0:
         raise ValueError("poses: no frame")
     poses = poses.astype(np.float64)
-    is_right = (np.abs(poses) <= _MAX_RADIANS).all(1)  # false for NaN
+    with np.errstate(all="ignore"):
+        angles = np.linalg.norm(poses[:, 3:].reshape(number, NUM_JOINTS - 1, 3), axis=2)
+    is_right = (np.abs(poses) <= _MAX_RADIANS).all(1) & (angles <= _MAX_ANGLE).all(1)  # false for NaN
+    if np.isfinite(poses).all() and is_right.mean() < 0.5:
+        raise ValueError(
+            f"poses: rotations that no joint has in {(~is_right).sum()} of {number} frames; expected radians, "
+            "not degrees"
+        )
     betas = np.full((number, NUM_BETAS), np.nan)
     if motion.betas is not None:
         given = np.broadcast_to(np.asarray(motion.betas, np.float64), betas.shape)
-        if not (np.abs(given[is_right]) <= _MAX_RADIANS).all():
-            raise ValueError("betas: NaN, or values that no shape has")
+        if not (np.abs(given[is_right]) <= _MAX_BETA).all():
+            raise ValueError(f"betas: NaN, or beyond {_MAX_BETA:g} standard deviations, which no one is")
         betas[:] = given
     if not is_right.any():
         raise ValueError(f"poses: NaN, or rotations that no joint has, in all {number} frames")

@@ -168,6 +168,15 @@ def test_arrays_may_be_of_any_order_and_packing(write_amass, tmp_path):
     )
 
 
+@pytest.mark.parametrize("value", [np.nan, 21.0, -1e9])
+def test_shapes_that_no_one_has_are_refused(value, write_amass):
+    path, _ = write_amass(betas=np.array([0, value, *np.zeros(14)]))
+    write_amass(place="CMU/02/a_poses.npz", betas=np.array([*np.zeros(10), value]))  # the first ten count
+    recordings = AmassSource(path.parents[2]).recordings
+    assert recordings.subjects == ("CMU/02",)
+    assert "betas: NaN, or beyond 20 standard deviations" in recordings.skipped["CMU/01/01_01_poses.npz"]
+
+
 def test_files_that_python_2_wrote_are_read_in_silence(write_amass, recwarn):
     path, poses = write_amass()
     with zipfile.ZipFile(path) as archive:

@@ -58,6 +58,9 @@ def test_files_of_a_folder_have_its_subfolders_as_subjects(some_poses, tmp_path)
     assert found.subjects == ("a", "a", "b", "c")
 
 
+SWUNG = np.tile(np.linspace(-1, 1, 72), (5, 1))
+
+
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
@@ -65,9 +68,10 @@ def test_files_of_a_folder_have_its_subfolders_as_subjects(some_poses, tmp_path)
         ({"poses": POSES, "clip": np.arange(5), "clips": ["a"]}, "clip: expected numbers of the 1 `clips`"),
         ({"poses": POSES, "subject": np.zeros((5, 2))}, "subject: expected one, or one for each of 5"),
         ({"poses": POSES, "betas": np.zeros((4, 10))}, r"betas: expected shape \(B,\), or \(T, B\) with T = 5"),
-        ({"poses": POSES, "betas": np.full(10, np.nan)}, "betas: NaN, or values that no shape has"),
+        ({"poses": POSES, "betas": np.full(10, np.nan)}, "betas: NaN, or beyond 20 standard deviations"),
         ({"poses": POSES, "frame": np.zeros(5)}, "frame: expected whole numbers"),
         ({"poses": POSES, "gender": "x"}, "gender: expected one of female, male, neutral, got 'x'"),
+        ({"poses": np.rad2deg(SWUNG)}, "rotations that no joint has in 5 of 5 frames; expected radians, not deg"),
         ({"poses": np.array(["a"])}, "poses: expected numbers, got <U1"),
         ({"poses": np.zeros((0, 72))}, "it holds no motion|poses: no frame"),
         ({"pose": POSES}, "poses: no such field in it"),
