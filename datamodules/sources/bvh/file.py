@@ -17,7 +17,7 @@ _MAX_JOINTS = 1000
 _MAX_VALUE = 1e7  # of any unit or winding of degrees
 _CHANNEL = re.compile(r"([XYZ])(position|rotation)", re.IGNORECASE)
 _MOTION = re.compile(r"^[ \t]*MOTION[ \t]*$", re.MULTILINE | re.IGNORECASE)
-_HEADER = re.compile(r"\s*Frames:\s*(\S+)\s*Frame\s+Time:\s*(\S+)[ \t]*\n?", re.IGNORECASE)
+_HEADER = re.compile(r"\s*Frames\s*:\s*(\S+)\s*Frame\s*Time\s*:\s*(\S+)[ \t]*\n?", re.IGNORECASE)
 
 
 class BvhFile(NamedTuple):
@@ -151,15 +151,17 @@ def _motion(text: str, width: int) -> tuple[np.ndarray, float | None, tuple[str,
     body = text[match.end() :]
     # A comma is a decimal one only where there are no points.
     body = body.replace(",", " " if "." in body else ".")
-    rows = [words for line in body.split("\n") if (words := line.split())]
-    whole = [words for words in rows if len(words) == width]
-    if not whole and match[1].isdecimal() and sum(map(len, rows)) == int(match[1][:9]) * width:
-        words = [word for row in rows for word in row]  # lines that end within a frame
-        whole = rows = [words[start : start + width] for start in range(0, len(words), width)]
+    # As text: words take ten times the memory of their numbers.
+    rows = [line for line in body.split("\n") if line.strip()]
+    lengths = [len(line.split()) for line in rows]
+    whole = [line for line, length in zip(rows, lengths) if length == width]
+    if not whole and match[1].isdecimal() and sum(lengths) == int(match[1][:9]) * width:
+        words = body.split()  # lines that end within a frame
+        whole = rows = [" ".join(words[start : start + width]) for start in range(0, len(words), width)]
     if not whole:
-        got = f"{len(rows)} lines, the first of {len(rows[0])} numbers" if rows else "none"
+        got = f"{len(rows)} lines, the first of {lengths[0]} numbers" if rows else "none"
         raise ValueError(f"MOTION: expected lines of {width} numbers, got {got}")
-    frames = _table(whole)
+    frames = _table(whole, width)
     is_right = (np.abs(frames) <= _MAX_VALUE).all(1)
     if not is_right.any():
         raise ValueError(f"MOTION: NaN, or what is no number, in all {len(frames)} frames")
@@ -170,16 +172,17 @@ def _motion(text: str, width: int) -> tuple[np.ndarray, float | None, tuple[str,
     return frames[is_right], rate, tuple(notes)
 
 
-def _table(rows: list[list[str]]) -> np.ndarray:
-    """Numbers of words in equally long rows; NaN for a word that is none."""
-    try:
-        return np.array([list(map(float, words)) for words in rows])
-    except ValueError:
-        values = np.full((len(rows), len(rows[0])), np.nan)
-        for row, words in enumerate(rows):
+def _table(lines: list[str], width: int) -> np.ndarray:
+    """Numbers of lines of `width` words; NaN in all of a line where one is no number."""
+    values = np.full((len(lines), width), np.nan)
+    for row, line in enumerate(lines):
+        words = line.split()
+        try:
+            values[row] = list(map(float, words))
+        except ValueError:
             if (numbers := _numbers(words)) is not None:
                 values[row] = numbers
-        return values
+    return values
 
 
 def joint_transforms(bvh: BvhFile, rows: np.ndarray) -> tuple[torch.Tensor, torch.Tensor]:

@@ -13,7 +13,7 @@ from ljn.body.skeleton import JOINT_INDEX
 from ljn.reading import READ_ERRORS, read_yaml, reason, shown
 
 _DIRECTORY = Path(__file__).parent / "skeletons"
-SHIPPED = ("smpl", "cmu_daz", "cmu_motionbuilder", "lafan1", "mixamo", "truebones", "bandai_namco")
+SHIPPED = ("smpl", "cmu_daz", "cmu_motionbuilder", "mixamo", "lafan1", "truebones", "bandai_namco")
 """The skeletons that ship; of those that fit equally well, the first counts."""
 AUTO = "auto"
 NEEDED = (

@@ -177,6 +177,7 @@ def _length(match):
         (lambda text: "\ufeff" + text, ()),
         (lambda text: text.encode("utf-16"), ()),
         (lambda text: text.replace("End Site", "EndSite"), ()),
+        (lambda text: text.replace("Frames:", "Frames :").replace("Frame Time:", "FrameTime :"), ()),
         (lambda text: text.replace("End Site\n", "End Site\n\n").lower(), ()),
         (lambda text: re.sub(r"((?:-?\d+\.\d+ ){20})", r"\1\n", text), ()),  # lines that end within a frame
         (lambda text: text.replace("Frames: 16", "Frames: 99"), ("Frames: '99' by the file, 16 lines are there",)),

@@ -85,3 +85,10 @@ def test_a_wrong_field_is_named(fields, message, tmp_path):
 def test_an_unknown_axis_is_named():
     with pytest.raises(ValueError, match="up: expected one of y, z, got 'x'"):
         NpzSource("a.npz", up="x")
+
+
+def test_a_rate_that_cannot_be_kept_is_said(some_poses, tmp_path):
+    np.savez(tmp_path / "a.npz", poses=some_poses(6), clip=np.repeat(["a_1", "b_1"], 3))
+    assert NpzSource(tmp_path / "a.npz").recordings.notes == {}
+    recordings = NpzSource(tmp_path / "a.npz", rate_hz=10).recordings
+    assert recordings.notes == {"a.npz": ["frame_rate: missing, so all frames count"]}
