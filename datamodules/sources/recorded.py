@@ -24,6 +24,7 @@ from datamodules.sources.subjects import Subjects, check_shares, read_splits, sp
 from ljn.body import GENDERS
 
 _BLOCK = 4096  # records at once; their random numbers hang on it
+_READING = 2  # of the tables that are kept: changed where a file is read otherwise
 _ORDER, _SHAPES = range(2)
 SHAPES = ("recorded", "drawn")
 
@@ -102,7 +103,7 @@ class RecordedSource(ABC):
     @property
     def reader_settings(self) -> str:
         """All that `read` depends on beside the file, as text."""
-        return f"{self.name} {self.version} {self.rate_hz} {self.stride}"
+        return f"{self.name} {self.version} {_READING} {self.rate_hz} {self.stride}"
 
     def steps(self, number: int, rate_hz: float | None, first: int = 0) -> np.ndarray:
         """The numbers of the frames that are taken of a file; see `steps`."""
