@@ -49,7 +49,7 @@ def read_bvh(path: Path) -> BvhFile:
     text = text.replace("\r\n", "\n").replace("\r", "\n")
     parts = _MOTION.split(text)
     if len(parts) != 2:
-        raise ValueError(f"MOTION: expected this line once, got it {len(parts) - 1} times")
+        raise ValueError(f"MOTION: expected this line of a BVH file once, got it {len(parts) - 1} times")
     names, parents, offsets, channels = _hierarchy(parts[0])
     frames, rate, notes = _motion(parts[1], sum(map(len, channels)))
     return BvhFile(names, parents, offsets, channels, frames, rate, notes)
@@ -68,6 +68,8 @@ def _decoded(content: bytes) -> str:
 def _statements(text: str) -> Iterator[tuple[int, list[str]]]:
     """Each line's number and words, with braces in lines of their own."""
     for number, line in enumerate(text.split("\n"), 1):
+        if line.lstrip().startswith(("#", "//")):
+            continue
         for part in re.split(r"([{}])", line):
             if words := part.split():
                 yield number, words
@@ -145,7 +147,7 @@ def _motion(text: str, width: int) -> tuple[np.ndarray, float | None, tuple[str,
         raise ValueError("CHANNELS: no joint has any")
     notes = []
     time = _numbers([match[2]])
-    rate = None if time is None or not 1e-5 < time[0] < 1e4 else float(1 / time[0])
+    rate = None if time is None or not 1e-5 < time[0] < 2 else float(1 / time[0])
     if rate is None:
         notes.append(f"Frame Time: expected seconds, got {shown(match[2])}, so all frames count")
     body = text[match.end() :]

@@ -6,7 +6,7 @@ import torch
 
 from datamodules.sources.bvh import BvhSource
 from datamodules.sources.bvh.file import joint_transforms, read_bvh
-from datamodules.sources.bvh.skeleton import NEEDED, SHIPPED, axes_of, known_skeletons, read_skeleton
+from datamodules.sources.bvh.skeleton import NEEDED, SHIPPED, axes_of, fitting, known_skeletons, read_skeleton
 from datamodules.sources.reference import REFERENCE_OFFSETS
 from ljn.body.skeleton import JOINT_INDEX, JOINT_NAMES
 from ljn.geometry.rotations import BODY_TO_OPENGL, rotmat_to_rotvec, rotvec_to_rotmat
@@ -176,6 +176,11 @@ def _length(match):
         (lambda text: text.replace("{", "{\n").replace("MOTION\n", "MOTION  \n\n"), ()),
         (lambda text: "\ufeff" + text, ()),
         (lambda text: text.encode("utf-16"), ()),
+        (lambda text: "# made by hand\n" + text.replace("{", "{\n// a joint"), ()),
+        (
+            lambda text: text.replace("Frame Time: 0.0333333", "Frame Time: 33.33"),
+            ("Frame Time: expected seconds, got '33.33', so all frames count",),
+        ),
         (lambda text: text.replace("End Site", "EndSite"), ()),
         (lambda text: text.replace("Frames:", "Frames :").replace("Frame Time:", "FrameTime :"), ()),
         (lambda text: text.replace("End Site\n", "End Site\n\n").lower(), ()),
@@ -209,7 +214,7 @@ def test_frames_that_are_not_whole_are_left_out(real_poses, make_bvh, tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda text: "", "MOTION: expected this line once, got it 0 times"),
+        (lambda text: "", "MOTION: expected this line of a BVH file once, got it 0 times"),
         (lambda text: text[: text.index("MOTION") + 30], "MOTION: expected 'Frames: N' and 'Frame Time"),
         (lambda text: text.replace("\nMOTION", "}\nMOTION"), "a } too many"),
         (lambda text: text.replace("JOINT lShin", "JOINT"), "expected a name after JOINT"),
@@ -292,6 +297,44 @@ def test_joints_that_can_be_guessed_may_be_missing_and_a_spine_may_have_any_numb
     xsens += [f"{side}{name}" for side in ("Left", "Right") for name in XSENS_LIMBS]
     found = known_skeletons("truebones")[0].find(xsens)
     assert [xsens[found[f"spine{number}"]] for number in (1, 2, 3)] == ["Chest", "Chest3", "Chest4"]
+
+
+UNITY = [
+    "Hips",
+    "Spine",
+    "Chest",
+    "UpperChest",
+    "Neck",
+    "Head",
+    "LeftShoulder",
+    "LeftUpperArm",
+    "LeftLowerArm",
+    "LeftHand",
+    "RightShoulder",
+    "RightUpperArm",
+    "RightLowerArm",
+    "RightHand",
+    "LeftUpperLeg",
+    "LeftLowerLeg",
+    "LeftFoot",
+    "LeftToes",
+    "RightUpperLeg",
+    "RightLowerLeg",
+    "RightFoot",
+    "RightToes",
+]
+
+
+def test_one_table_serves_several_programs_names():
+    [(skeleton, places), *_] = fitting(known_skeletons("auto"), UNITY)
+    assert skeleton.name == "mixamo"
+    assert skeleton.missing(UNITY) == []
+    assert {joint: UNITY[place] for joint, place in places.items() if "spine" in joint} == {
+        "spine1": "Spine", "spine2": "Chest", "spine3": "UpperChest",
+    }  # fmt: skip
+    assert [UNITY[places[f"l_{name}"]] for name in ("collar", "shoulder", "hip", "knee")] == [
+        "LeftShoulder", "LeftUpperArm", "LeftUpperLeg", "LeftLowerLeg",
+    ]  # fmt: skip
 
 
 XSENS_LIMBS = ("Collar", "Shoulder", "Elbow", "Wrist", "Hip", "Knee", "Ankle", "Toe")
