@@ -299,30 +299,9 @@ def test_joints_that_can_be_guessed_may_be_missing_and_a_spine_may_have_any_numb
     assert [xsens[found[f"spine{number}"]] for number in (1, 2, 3)] == ["Chest", "Chest3", "Chest4"]
 
 
-UNITY = [
-    "Hips",
-    "Spine",
-    "Chest",
-    "UpperChest",
-    "Neck",
-    "Head",
-    "LeftShoulder",
-    "LeftUpperArm",
-    "LeftLowerArm",
-    "LeftHand",
-    "RightShoulder",
-    "RightUpperArm",
-    "RightLowerArm",
-    "RightHand",
-    "LeftUpperLeg",
-    "LeftLowerLeg",
-    "LeftFoot",
-    "LeftToes",
-    "RightUpperLeg",
-    "RightLowerLeg",
-    "RightFoot",
-    "RightToes",
-]
+UNITY_LIMBS = ("Shoulder", "UpperArm", "LowerArm", "Hand", "UpperLeg", "LowerLeg", "Foot", "Toes")
+UNITY = ["Hips", "Spine", "Chest", "UpperChest", "Neck", "Head"]
+UNITY += [f"{side}{name}" for side in ("Left", "Right") for name in UNITY_LIMBS]
 
 
 def test_one_table_serves_several_programs_names():
