@@ -9,6 +9,7 @@ import re
 import reprlib
 import struct
 import tokenize
+import warnings
 import zipfile
 import zlib
 from collections.abc import Collection, Iterator
@@ -142,7 +143,12 @@ def _header(stream: io.BytesIO) -> tuple[tuple[int, ...], bool, np.dtype]:
     form = np.lib.format
     if (version := form.read_magic(stream)) not in ((1, 0), (2, 0)):
         raise ValueError(f"an .npy file of version {version}")
-    return form.read_array_header_1_0(stream) if version == (1, 0) else form.read_array_header_2_0(stream)
+    read = form.read_array_header_1_0 if version == (1, 0) else form.read_array_header_2_0
+    with warnings.catch_warnings():
+        warnings.filterwarnings(
+            "ignore", ".*created on Python 2", UserWarning
+        )  # it advises to save the file again
+        return read(stream)
 
 
 def array_in(content: bytes) -> np.ndarray:

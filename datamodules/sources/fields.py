@@ -8,7 +8,7 @@ import numpy as np
 from ljn.body import GENDERS
 from ljn.body.files import NUM_BETAS
 from ljn.body.skeleton import NUM_JOINTS
-from ljn.reading import READ_ERRORS, read_arrays, reason, shown
+from ljn.reading import READ_ERRORS, array_in, read_arrays, read_entries, reason, shown
 
 RATES = ("mocap_framerate", "mocap_frame_rate", "frame_rate", "fps")
 _BODY_WIDTH = 66  # the 22 joints that SMPL, SMPL-H and SMPL-X share
@@ -23,11 +23,19 @@ def read_fields(path: Path, required: Collection[str], optional: Collection[str]
         ValueError: It cannot be read, or one of `required` is missing.
     """
     try:
-        fields = read_arrays(path, required)
+        entries = read_entries(path, required)
+        if "" in entries:  # an .npy file, or none at all
+            array_in(entries[""])
     except READ_ERRORS as error:
-        raise ValueError(f"it cannot be read ({reason(error)}); expected an .npz file") from error
-    if missing := [name for name in required if name not in fields]:
+        raise ValueError(f"it cannot be read ({reason(error)}); expected a whole .npz file") from error
+    if missing := [name for name in required if name not in entries]:
         raise ValueError(f"{missing[0]}: no such field in it")
+    fields = {}
+    for name in required:
+        try:
+            fields[name] = array_in(entries[name])
+        except READ_ERRORS as error:
+            raise ValueError(f"{name}: {reason(error)}") from error
     for name in optional:
         try:
             fields |= read_arrays(path, (name,))

@@ -1,16 +1,30 @@
 """Poses of several sources, mixed by weight."""
 
 import hashlib
+import logging
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from itertools import combinations
 from pathlib import Path
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 
 from datamodules.sources import SPLITS, PoseRecords, PoseSource
 from ljn.body import GENDERS
+from ljn.reading import brief
+
+_LOG = logging.getLogger(__name__)
 
 _CHOICE = 2  # of random streams; the sources draw from theirs
+
+
+@runtime_checkable
+class Peopled(Protocol):
+    """A source that says whom it shows."""
+
+    def people(self, split: str) -> Iterable[tuple[str, str]]:
+        """Each person of a split: the data set, such as `CMU`, or nothing, and the name in it, without zeros before."""
 
 
 class MixedSource:
@@ -70,9 +84,40 @@ class MixedSource:
         return tuple(gender for gender in GENDERS if gender in wanted)
 
     def check(self) -> None:
-        """See `PoseSource.check`."""
-        for source in self.sources.values():
-            source.check()
+        """See `PoseSource.check`; also warns of people whom two sources show, in different splits."""
+        for name, source in self.sources.items():
+            try:
+                source.check()
+            except (FileNotFoundError, ValueError) as error:
+                text = str(error).replace("data.source.", f"data.source.sources.{name}.")
+                raise type(error)(text) from error
+        self._warn_of_people_in_several_splits()
+
+    def _warn_of_people_in_several_splits(self) -> None:
+        shown_by = [
+            (split, name, *person)
+            for name, source in self.sources.items()
+            if isinstance(source, Peopled)
+            for split in SPLITS
+            for person in source.people(split)
+        ]
+        places: dict[str, list[tuple[str, str, str]]] = {}
+        for split, name, dataset, person in sorted(shown_by):
+            places.setdefault(person, []).append((split, name, dataset))
+        doubtful = [
+            f"{person} ({name}: {split}, {other}: {other_split})"
+            for person, rows in sorted(places.items())
+            for (split, name, dataset), (other_split, other, other_dataset) in combinations(rows, 2)
+            if name != other
+            and split != other_split
+            and (dataset == other_dataset or not (dataset and other_dataset))
+        ]
+        if doubtful:
+            _LOG.warning(
+                "people of the same name are in different splits of two sources: %s; if they are the same, give each "
+                "source a file of splits, data.source.sources.NAME.splits=FILE.yaml",
+                brief(f"{len(doubtful)}, such as {', '.join(doubtful)}"),
+            )
 
     def motion(self, split: str) -> dict[str, int]:
         """The sources' own, with their names before a dot; see `PoseSource.motion`."""

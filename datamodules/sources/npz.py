@@ -62,10 +62,14 @@ class NpzSource(RecordedSource):
             subject = [name.split("_")[0] for name in clip]
         frame = _frames(fields, number)
         betas = betas_of(fields["betas"], number) if "betas" in fields else None
+        rate = rate_of(fields)
+        notes = (
+            ("frame_rate: missing, so all frames count",) if self.rate_hz is not None and rate is None else ()
+        )
         keys = ["/".join(key) for key in zip(subject or [""] * number, clip or [""] * number)]
-        motions = []
+        motions: list[Motion] = []
         for key, rows in by_clip(keys):
-            rows = rows[self.steps(len(rows), rate_of(fields))]
+            rows = rows[self.steps(len(rows), rate)]
             first = rows[0]
             motions.append(
                 Motion(
@@ -75,6 +79,7 @@ class NpzSource(RecordedSource):
                     clip[first] if clip else key.strip("/"),
                     gender_of(gender[first]) if gender else None,
                     betas if betas is None or betas.ndim == 1 else betas[rows],
+                    notes if not motions else (),
                 )
             )
         return motions

@@ -17,12 +17,14 @@ from datamodules.sources.recordings import (
     find_motion_files,
     read_recordings,
     steps,
+    subject_of,
 )
 from datamodules.sources.shapes import Shapes, check_shapes, draw_shapes
 from datamodules.sources.subjects import Subjects, check_shares, read_splits, split_by_hash
 from ljn.body import GENDERS
 
 _BLOCK = 4096  # records at once; their random numbers hang on it
+_READING = 2  # of the tables that are kept: changed where a file is read otherwise
 _ORDER, _SHAPES = range(2)
 SHAPES = ("recorded", "drawn")
 
@@ -94,10 +96,14 @@ class RecordedSource(ABC):
         """Whether a file with the suffix is to be read at all, by its name."""
         return True
 
+    def subject_of(self, file: Path, root: Path) -> str:
+        """Whose motion a file below the root is, where `read` does not say it; see `recordings.subject_of`."""
+        return subject_of(file, root)
+
     @property
     def reader_settings(self) -> str:
         """All that `read` depends on beside the file, as text."""
-        return f"{self.name} {self.version} {self.rate_hz} {self.stride}"
+        return f"{self.name} {self.version} {_READING} {self.rate_hz} {self.stride}"
 
     def steps(self, number: int, rate_hz: float | None, first: int = 0) -> np.ndarray:
         """The numbers of the frames that are taken of a file; see `steps`."""
@@ -118,7 +124,9 @@ class RecordedSource(ABC):
         files = [file for file in find_motion_files(self.path, self.suffix) if self.is_motion(file)]
         if not files:
             raise FileNotFoundError(f"data.source.path: no {self.suffix} file of a motion in '{self.path}'")
-        return read_recordings(self.path, files, self.read, self.reader_settings, self.cache_dir)
+        return read_recordings(
+            self.path, files, self.read, self.reader_settings, self.cache_dir, self.subject_of
+        )
 
     @cached_property
     def _subjects(self) -> Subjects:
@@ -140,6 +148,11 @@ class RecordedSource(ABC):
             "filters": self.filters.fingerprint,
         }
         return hashlib.sha256(json.dumps(settings, sort_keys=True).encode()).hexdigest()[:16]
+
+    def people(self, split: str) -> list[tuple[str, str]]:
+        """See `datamodules.sources.mixed.Peopled`."""
+        parts = [subject.rpartition("/") for subject in self._subjects[split]]
+        return [(dataset.rpartition("/")[2], name.lstrip("0") or name) for dataset, _, name in parts]
 
     def rows(self, split: str) -> np.ndarray:
         """The frames of a split before any filter, rows of the table.

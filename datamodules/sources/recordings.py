@@ -3,6 +3,9 @@
 import hashlib
 import json
 import logging
+import os
+import re
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,8 +23,13 @@ from ljn.reading import brief
 
 _LOG = logging.getLogger(__name__)
 _DECIMALS = 5  # of radians: as the embedded source's poses
-_MAX_RADIANS = 100.0  # no file turns a joint farther; a damaged number does
+_MAX_RADIANS = 100.0  # no file turns a body farther, round after round; a damaged number does
+_MAX_ANGLE = 4 * np.pi  # no file turns a joint farther
+_MAX_BETA = 20.0  # a person 20 standard deviations off spoils a training; fits of people reach 5, bad ones 10
+_ARCHIVES = (".zip", ".7z", ".rar", ".tar", ".gz", ".bz2", ".xz", ".tgz")
+_FEW_NOTES = 3  # of a kind, each with its file; all of them are counted at the end
 _FEW_FILES = 50  # read without a progress bar
+_SUBJECT = re.compile(r"(?<![^\W_])subject[-_]?\d+", re.IGNORECASE)
 NO_GENDER = -1
 
 
@@ -80,14 +88,31 @@ def find_motion_files(path: Path, suffix: str) -> list[Path]:
         return [path]
     if not path.is_dir():
         raise FileNotFoundError(f"data.source.path: no file or folder '{path}'")
-    files = sorted(file for file in path.rglob("*") if file.suffix.lower() == suffix and file.is_file())
-    if not files:
-        raise FileNotFoundError(f"data.source.path: no {suffix} file in '{path}' or below")
-    return files
+    found: list[Path] = []
+    num_archives, seen = 0, set()
+    for folder, below, names in os.walk(path, followlinks=True):  # a data set may be a link to another disk
+        if (place := os.path.realpath(folder)) in seen:
+            below.clear()
+            continue
+        seen.add(place)
+        # macOS leaves a ._NAME beside each file.
+        files = [name for name in names if not name.startswith("._")]
+        found += [Path(folder, name) for name in files if name.lower().endswith(suffix)]
+        num_archives += sum(name.lower().endswith(_ARCHIVES) for name in files)
+    found = sorted(file for file in found if file.is_file())
+    if not found:
+        hint = f"; unpack the {num_archives} archives there" if num_archives else ""
+        raise FileNotFoundError(f"data.source.path: no {suffix} file in '{path}' or below{hint}")
+    return found
 
 
 def subject_of(file: Path, root: Path) -> str:
-    """A file's subject by its place: its folder below the root; right in it, its name up to a `_`, `-` or blank."""
+    """A file's subject by its place: its folder below the root; right in it, its name up to a `_`, `-` or blank.
+
+    But `walk1_subject5` is of `subject5`, wherever it is.
+    """
+    if (match := _SUBJECT.search(file.stem)) is not None:
+        return match[0]
     folder = file.parent.relative_to(root.parent if root.is_file() else root).as_posix()
     if folder != ".":
         return folder
@@ -95,7 +120,12 @@ def subject_of(file: Path, root: Path) -> str:
 
 
 def read_recordings(
-    root: Path, files: Sequence[Path], read: Reader, settings: str, cache_dir: Path | None
+    root: Path,
+    files: Sequence[Path],
+    read: Reader,
+    settings: str,
+    cache_dir: Path | None,
+    subject: Callable[[Path, Path], str] = subject_of,
 ) -> Recordings:
     """The table of some files below a root, from `cache_dir` where it is there already.
 
@@ -107,13 +137,14 @@ def read_recordings(
         read: Reads one; only its `ValueError` and `OSError` are expected.
         settings: All that `read` depends on but the file.
         cache_dir: Where the table is kept; None for nowhere.
+        subject: Says whose motion a file below the root is, where `read` does not.
 
     Raises:
         ValueError: No file has a motion.
     """
 
     def make() -> dict[str, torch.Tensor]:
-        return _tensors(_gather(root, files, read))
+        return _tensors(_gather(root, files, read, subject))
 
     if cache_dir is None:
         stored = make()
@@ -135,6 +166,9 @@ def read_recordings(
         *(len(files) - len(recordings.skipped), len(files), len(recordings.clips)),
         *(len(set(recordings.subjects)), len(recordings.pose)),
     )
+    kinds = Counter(kind for said in notes.values() for kind in {_kind(note) for note in said})
+    for kind, count in kinds.most_common():
+        _LOG.warning("%d of %d files: %s", count, len(files), kind)
     if recordings.skipped:
         name, why = next(iter(recordings.skipped.items()))
         _LOG.warning(
@@ -143,13 +177,21 @@ def read_recordings(
     return recordings
 
 
-def _gather(root: Path, files: Sequence[Path], read: Reader) -> dict[str, Any]:
+def _kind(note: str) -> str:
+    """A note without the numbers in it."""
+    return re.sub(r"'[^']*'|\d+", "...", note)
+
+
+def _gather(
+    root: Path, files: Sequence[Path], read: Reader, subject: Callable[[Path, Path], str]
+) -> dict[str, Any]:
     """Columns and names of all files' motions."""
     parts: list[tuple[np.ndarray, ...]] = []
     clips: list[str] = []
     subjects: list[str] = []
     skipped: dict[str, str] = {}
     notes: dict[str, list[str]] = {}
+    kinds: Counter[str] = Counter()
     folder = root.parent if root.is_file() else root
     for file in tqdm(files, unit="file", desc="motions", disable=None if len(files) > _FEW_FILES else True):
         place = file.relative_to(folder).as_posix()
@@ -164,11 +206,13 @@ def _gather(root: Path, files: Sequence[Path], read: Reader) -> dict[str, Any]:
         for motion, columns in motions:
             stem = place.removesuffix(file.suffix) if len(files) > 1 or not motion.name else ""
             clips.append("/".join(filter(None, (stem, motion.name))).replace("|", "_"))
-            subjects.append(motion.subject or subject_of(file, root))
+            subjects.append(motion.subject or subject(file, root))
             parts.append((*columns, np.full(len(columns[0]), len(clips) - 1)))
-            if motion.notes:
-                notes.setdefault(place, []).extend(motion.notes)
-                _LOG.warning("%s: %s", place, "; ".join(motion.notes))
+            for note in motion.notes:
+                notes.setdefault(place, []).append(note)
+                kinds[kind := _kind(note)] += 1
+                if kinds[kind] <= _FEW_NOTES:
+                    _LOG.warning("%s: %s", place, note)
     if not clips:
         name, why = next(iter(skipped.items()))
         raise ValueError(
@@ -190,12 +234,19 @@ def _checked(motion: Motion) -> tuple[Motion, tuple[np.ndarray, ...]]:
     if number == 0:
         raise ValueError("poses: no frame")
     poses = poses.astype(np.float64)
-    is_right = (np.abs(poses) <= _MAX_RADIANS).all(1)  # false for NaN
+    with np.errstate(all="ignore"):
+        angles = np.linalg.norm(poses[:, 3:].reshape(number, NUM_JOINTS - 1, 3), axis=2)
+    is_right = (np.abs(poses) <= _MAX_RADIANS).all(1) & (angles <= _MAX_ANGLE).all(1)  # false for NaN
+    if np.isfinite(poses).all() and is_right.mean() < 0.5:
+        raise ValueError(
+            f"poses: rotations that no joint has in {(~is_right).sum()} of {number} frames; expected radians, "
+            "not degrees"
+        )
     betas = np.full((number, NUM_BETAS), np.nan)
     if motion.betas is not None:
         given = np.broadcast_to(np.asarray(motion.betas, np.float64), betas.shape)
-        if not (np.abs(given[is_right]) <= _MAX_RADIANS).all():
-            raise ValueError("betas: NaN, or values that no shape has")
+        if not (np.abs(given[is_right]) <= _MAX_BETA).all():
+            raise ValueError(f"betas: NaN, or beyond {_MAX_BETA:g} standard deviations, which no one is")
         betas[:] = given
     if not is_right.any():
         raise ValueError(f"poses: NaN, or rotations that no joint has, in all {number} frames")

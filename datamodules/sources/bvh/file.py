@@ -1,5 +1,6 @@
 """Reading a BVH file: a skeleton and its joints' angles, frame by frame."""
 
+import codecs
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,7 +17,7 @@ _MAX_JOINTS = 1000
 _MAX_VALUE = 1e7  # of any unit or winding of degrees
 _CHANNEL = re.compile(r"([XYZ])(position|rotation)", re.IGNORECASE)
 _MOTION = re.compile(r"^[ \t]*MOTION[ \t]*$", re.MULTILINE | re.IGNORECASE)
-_HEADER = re.compile(r"\s*Frames:\s*(\S+)\s*Frame\s+Time:\s*(\S+)[ \t]*\n?", re.IGNORECASE)
+_HEADER = re.compile(r"\s*Frames\s*:\s*(\S+)\s*Frame\s*Time\s*:\s*(\S+)[ \t]*\n?", re.IGNORECASE)
 
 
 class BvhFile(NamedTuple):
@@ -44,22 +45,31 @@ def read_bvh(path: Path) -> BvhFile:
     if (size := path.stat().st_size) > _MAX_BYTES:
         raise ValueError(f"{size} bytes, expected at most {_MAX_BYTES}")
     content = path.read_bytes()
-    try:
-        text = content.decode("utf-8-sig")
-    except UnicodeDecodeError:
-        text = content.decode("latin-1")
+    text = _decoded(content)
     text = text.replace("\r\n", "\n").replace("\r", "\n")
     parts = _MOTION.split(text)
     if len(parts) != 2:
-        raise ValueError(f"MOTION: expected this line once, got it {len(parts) - 1} times")
+        raise ValueError(f"MOTION: expected this line of a BVH file once, got it {len(parts) - 1} times")
     names, parents, offsets, channels = _hierarchy(parts[0])
     frames, rate, notes = _motion(parts[1], sum(map(len, channels)))
     return BvhFile(names, parents, offsets, channels, frames, rate, notes)
 
 
+def _decoded(content: bytes) -> str:
+    is_wide = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+    for encoding in ("utf-16" if is_wide else "utf-8-sig", "latin-1"):
+        try:
+            return content.decode(encoding)
+        except UnicodeDecodeError:
+            continue
+    raise AssertionError("latin-1 has every byte")
+
+
 def _statements(text: str) -> Iterator[tuple[int, list[str]]]:
     """Each line's number and words, with braces in lines of their own."""
     for number, line in enumerate(text.split("\n"), 1):
+        if line.lstrip().startswith(("#", "//")):
+            continue
         for part in re.split(r"([{}])", line):
             if words := part.split():
                 yield number, words
@@ -85,7 +95,7 @@ def _hierarchy(
             parents.append(-1 if here is None else here)
             pending = len(names)
             names.append(" ".join(words[1:]))
-        elif keyword == "END":
+        elif keyword in ("END", "ENDSITE"):
             pending = None
         elif keyword == "{":
             open_joints.append(pending)
@@ -137,18 +147,23 @@ def _motion(text: str, width: int) -> tuple[np.ndarray, float | None, tuple[str,
         raise ValueError("CHANNELS: no joint has any")
     notes = []
     time = _numbers([match[2]])
-    rate = None if time is None or not 1e-5 < time[0] < 1e4 else float(1 / time[0])
+    rate = None if time is None or not 1e-5 < time[0] < 2 else float(1 / time[0])
     if rate is None:
         notes.append(f"Frame Time: expected seconds, got {shown(match[2])}, so all frames count")
     body = text[match.end() :]
     # A comma is a decimal one only where there are no points.
     body = body.replace(",", " " if "." in body else ".")
-    rows = [words for line in body.split("\n") if (words := line.split())]
-    whole = [words for words in rows if len(words) == width]
+    # As text: words take ten times the memory of their numbers.
+    rows = [line for line in body.split("\n") if line.strip()]
+    lengths = [len(line.split()) for line in rows]
+    whole = [line for line, length in zip(rows, lengths) if length == width]
+    if not whole and match[1].isdecimal() and sum(lengths) == int(match[1][:9]) * width:
+        words = body.split()  # lines that end within a frame
+        whole = rows = [" ".join(words[start : start + width]) for start in range(0, len(words), width)]
     if not whole:
-        got = f"{len(rows)} lines, the first of {len(rows[0])} numbers" if rows else "none"
+        got = f"{len(rows)} lines, the first of {lengths[0]} numbers" if rows else "none"
         raise ValueError(f"MOTION: expected lines of {width} numbers, got {got}")
-    frames = _table(whole)
+    frames = _table(whole, width)
     is_right = (np.abs(frames) <= _MAX_VALUE).all(1)
     if not is_right.any():
         raise ValueError(f"MOTION: NaN, or what is no number, in all {len(frames)} frames")
@@ -159,16 +174,17 @@ def _motion(text: str, width: int) -> tuple[np.ndarray, float | None, tuple[str,
     return frames[is_right], rate, tuple(notes)
 
 
-def _table(rows: list[list[str]]) -> np.ndarray:
-    """Numbers of words in equally long rows; NaN for a word that is none."""
-    try:
-        return np.array([list(map(float, words)) for words in rows])
-    except ValueError:
-        values = np.full((len(rows), len(rows[0])), np.nan)
-        for row, words in enumerate(rows):
+def _table(lines: list[str], width: int) -> np.ndarray:
+    """Numbers of lines of `width` words; NaN in all of a line where one is no number."""
+    values = np.full((len(lines), width), np.nan)
+    for row, line in enumerate(lines):
+        words = line.split()
+        try:
+            values[row] = list(map(float, words))
+        except ValueError:
             if (numbers := _numbers(words)) is not None:
                 values[row] = numbers
-        return values
+    return values
 
 
 def joint_transforms(bvh: BvhFile, rows: np.ndarray) -> tuple[torch.Tensor, torch.Tensor]:

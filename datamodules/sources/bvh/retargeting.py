@@ -12,11 +12,11 @@ import torch
 from torch import Tensor
 
 from datamodules.sources.bvh.file import BvhFile, joint_transforms
-from datamodules.sources.bvh.skeleton import Skeleton
+from datamodules.sources.bvh.skeleton import Skeleton, axes_of
 from datamodules.sources.reference import REFERENCE_OFFSETS
 from ljn.body.kinematics import SIDES
 from ljn.body.skeleton import JOINT_INDEX, NUM_JOINTS, PARENTS
-from ljn.geometry.rotations import interpolate_rotmat, rotvec_to_rotmat
+from ljn.geometry.rotations import interpolate_rotmat, rotation_about, rotvec_to_rotmat
 
 _LIMBS = {
     f"{side}_{joint}": f"{side}_{child}"
@@ -45,19 +45,32 @@ def retarget(bvh: BvhFile, skeleton: Skeleton, places: dict[str, int], rows: np.
         ValueError: Its rest pose is no person's who stands upright.
     """
     rotations, _ = joint_transforms(bvh, rows)
-    rest, positions = _rest(bvh, skeleton)
+    rest, positions = _rest(bvh, skeleton, places)
     joints = {name: positions[place] for name, place in places.items()}
     axes = _smpl_axes(joints)
-    world = {name: axes @ rotations[:, place] @ rest[place].T @ axes.T for name, place in places.items()}
+    if skeleton.rest_axes and not torch.equal(axes, torch.eye(3, dtype=torch.float64)):
+        raise ValueError(f"OFFSET: {_NO_REST}, by the axes of {skeleton.name}")
+    facing = torch.eye(3, dtype=torch.float64)
+    if skeleton.rest_frame is not None:  # a frame may face anywhere
+        left = axes @ (joints["l_hip"] - joints["r_hip"])
+        facing = rotation_about("y", torch.atan2(-left[2], left[0]))
+    world = {
+        name: axes @ rotations[:, place] @ rest[place].T @ axes.T @ facing for name, place in places.items()
+    }
     if not skeleton.same_rest:
-        for name, turn in _rest_turns({name: axes @ position for name, position in joints.items()}).items():
+        upright = {name: facing.T @ axes @ position for name, position in joints.items()}
+        for name, turn in _rest_turns(upright, bool(skeleton.rest_axes)).items():
             if name in world:
                 world[name] = world[name] @ turn
     return _local(_completed(world))
 
 
-def _rest(bvh: BvhFile, skeleton: Skeleton) -> tuple[Tensor, Tensor]:
+def _rest(bvh: BvhFile, skeleton: Skeleton, places: dict[str, int]) -> tuple[Tensor, Tensor]:
     """Rotations `(J, 3, 3)` and positions `(J, 3)` of the pose that the file rests in, its own axes."""
+    if skeleton.rest_axes:
+        return _rest_of_axes(
+            bvh, {places[name]: text for name, text in skeleton.rest_axes.items() if name in places}
+        )
     if skeleton.rest_frame is None:
         still = bvh._replace(channels=((),) * len(bvh.names))
         rotations, positions = joint_transforms(still, np.array([0]))
@@ -66,6 +79,19 @@ def _rest(bvh: BvhFile, skeleton: Skeleton) -> tuple[Tensor, Tensor]:
     else:
         raise ValueError(f"rest_frame: frame {skeleton.rest_frame} of {len(bvh.frames)}")
     return rotations[0], positions[0]
+
+
+def _rest_of_axes(bvh: BvhFile, axes: dict[int, str]) -> tuple[Tensor, Tensor]:
+    """The T-pose in which the axes of the file's joints lead left, up and forward as a table says."""
+    rotations: list[Tensor] = []
+    positions: list[Tensor] = []
+    for joint, parent in enumerate(bvh.parents):
+        rows = axes_of(axes[joint]) if joint in axes else None
+        above = torch.eye(3, dtype=torch.float64) if parent < 0 else rotations[parent]
+        rotations.append(above if rows is None else torch.from_numpy(rows))
+        offset = torch.from_numpy(bvh.offsets[joint])
+        positions.append(offset if parent < 0 else positions[parent] + above @ offset)
+    return torch.stack(rotations), torch.stack(positions)
 
 
 def _smpl_axes(joints: dict[str, Tensor]) -> Tensor:
@@ -98,8 +124,8 @@ def _smpl_axes(joints: dict[str, Tensor]) -> Tensor:
 
 
 _NO_REST = (
-    "its rest pose shows no one standing upright with arms out or down (rest_frame: 0 in a file of "
-    "data.source.skeleton takes a frame that does)"
+    "its rest pose shows no one standing upright with arms out or down (in a file of "
+    "data.source.skeleton, rest_frame: 0 takes a frame that does, and rest_axes says where bones along one axis lead)"
 )
 
 
@@ -113,10 +139,14 @@ def _axis(direction: Tensor, name: str) -> Tensor:
     return axis
 
 
-def _rest_turns(joints: dict[str, Tensor]) -> dict[str, Tensor]:
-    """O: for each joint whose bone rests elsewhere than SMPL's, the rotation `(3, 3)` from SMPL's to it."""
+def _rest_turns(joints: dict[str, Tensor], with_feet: bool) -> dict[str, Tensor]:
+    """O: for each joint whose bone rests elsewhere than SMPL's, the rotation `(3, 3)` from SMPL's to it.
+
+    Soles rest flat, however high the joints of a foot lie, unless its bone is all that is known of it (`with_feet`).
+    """
     turns = {}
-    for joint, child in _LIMBS.items():
+    feet = {f"{side}_ankle": f"{side}_foot" for side in SIDES if with_feet and f"{side}_foot" in joints}
+    for joint, child in (_LIMBS | feet).items():
         smpl = REFERENCE_OFFSETS[JOINT_INDEX[child]]
         turns[joint] = _between(smpl, joints[child] - joints[joint])
     for side in SIDES:

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from datamodules.sources.bvh.file import read_bvh
+from datamodules.sources.bvh.file import BvhFile, read_bvh
 from datamodules.sources.bvh.retargeting import retarget
 from datamodules.sources.bvh.skeleton import AUTO, Skeleton, fitting, known_skeletons
 from datamodules.sources.recorded import RecordedSource
@@ -45,7 +45,16 @@ class BvhSource(RecordedSource):
     def read(self, path: Path) -> list[Motion]:
         """See `RecordedSource.read`."""
         bvh = read_bvh(path)
-        skeleton, places = fitting(self._skeletons, bvh.names)
+        candidates = fitting(self._skeletons, bvh.names)
+        errors: list[ValueError] = []
+        for skeleton, places in candidates:
+            try:
+                return [self._motion(bvh, skeleton, places)]
+            except ValueError as error:  # the same names, but another rest pose
+                errors.append(error)
+        raise errors[0]
+
+    def _motion(self, bvh: BvhFile, skeleton: Skeleton, places: dict[str, int]) -> Motion:
         frame = self.steps(len(bvh.frames), bvh.rate_hz, skeleton.skip_frames)
         if not len(frame):
             raise ValueError(
@@ -53,4 +62,7 @@ class BvhSource(RecordedSource):
             )
         rotmat = retarget(bvh, skeleton, places, frame)
         pose = smpl_pose_to_body_world(rotmat_to_rotvec(rotmat).flatten(1)).numpy()
-        return [Motion(pose, np.asarray(frame), notes=bvh.notes)]
+        notes = bvh.notes
+        if missing := skeleton.missing(bvh.names):
+            notes = (*notes, f"joints: no {', '.join(missing)} of {skeleton.name}; these follow the others")
+        return Motion(pose, np.asarray(frame), notes=notes)

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from functools import cached_property
@@ -109,6 +110,11 @@ class EmbeddedSource:
     def mixture(self) -> ClipMixture:
         """The clips, mixed."""
         return ClipMixture(self._clips, self._split, self.settings, self._body, self.max_beta, self.genders)
+
+    def people(self, split: str) -> list[tuple[str, str]]:
+        """See `datamodules.sources.mixed.Peopled`: CMU's subjects, whose clips are numbers such as `01_03`."""
+        found = [re.fullmatch(r"0*(\d+)_\d+", clip) for clip in self._split[split]]
+        return sorted({("CMU", match[1]) for match in found if match})
 
     def motion(self, split: str) -> dict[str, int]:
         """See `PoseSource.motion`."""

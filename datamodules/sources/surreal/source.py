@@ -155,6 +155,10 @@ class SurrealSource:
         """See `Examinable`: cameras and bodies, of clips of all splits."""
         yield from examine_clips(self.tree, self.entries, bodies, num_clips)
 
+    def people(self, split: str) -> list[tuple[str, str]]:
+        """See `datamodules.sources.mixed.Peopled`: CMU's subjects."""
+        return sorted({("CMU", str(entry.subject).lstrip("0")) for entry in self._parts[split]})
+
     def motion(self, split: str) -> dict[str, int]:
         """See `PoseSource.motion`: also subjects and sequences, and the files of the split that cannot be read."""
         clips = self._parts[split]

@@ -82,8 +82,12 @@ def _turn(start, end):
     return Rotation.from_rotvec(axis / max(np.linalg.norm(axis), 1e-12) * angle).as_matrix()
 
 
-def bvh_text(poses, skeleton=CMU_DAZ, order="ZXY", frame_time=1 / 30, axes=None):
-    """A BVH file of poses `(T, 72)` in SMPL's axes, its first frame a T-pose; `axes` leads SMPL's to the file's."""
+def bvh_text(poses, skeleton=CMU_DAZ, order="ZXY", frame_time=1 / 30, axes=None, rest=None):
+    """A BVH file of poses `(T, 72)` in SMPL's axes, its first frame a T-pose; `axes` leads SMPL's to the file's.
+
+    `rest` are rotations `(3, 3)` by name, of joints whose own axes lie otherwise than the world's in the T-pose.
+    """
+    rest = rest or {}
     axes = np.eye(3) if axes is None else axes
     rows = {name: (parent, np.array(offset, float), joint) for name, parent, offset, joint in skeleton}
     of_joint = {joint: name for name, (_, _, joint) in rows.items() if joint}
@@ -99,8 +103,14 @@ def bvh_text(poses, skeleton=CMU_DAZ, order="ZXY", frame_time=1 / 30, axes=None)
         turned[name] = world[:, JOINT_INDEX[joint]] @ turn.T
     lines, columns = ["HIERARCHY"], []
 
+    def rest_of(name):
+        if name is None:
+            return np.eye(3)
+        return rest[name] if name in rest else rest_of(rows[name][0])
+
     def write(name, depth):
         parent, offset, _ = rows[name]
+        offset = rest_of(parent).T @ offset
         indent = "  " * depth
         lines.append(f"{indent}{'JOINT' if parent else 'ROOT'} {name}")
         lines.append(f"{indent}{{")
@@ -117,7 +127,7 @@ def bvh_text(poses, skeleton=CMU_DAZ, order="ZXY", frame_time=1 / 30, axes=None)
             channels = ["Xposition", "Yposition", "Zposition", *channels]
             columns.append(np.tile(axes @ [0, 90.0, 0], (len(poses), 1)))
         lines.append(f"{indent}  CHANNELS {len(channels)} {' '.join(channels)}")
-        local = axes @ local @ axes.T
+        local = axes @ rest_of(parent).T @ local @ rest_of(name) @ axes.T
         columns.append(Rotation.from_matrix(local).as_euler(order, degrees=True))
         children = [child for child, (of, _, _) in rows.items() if of == name]
         for child in children:
@@ -130,7 +140,8 @@ def bvh_text(poses, skeleton=CMU_DAZ, order="ZXY", frame_time=1 / 30, axes=None)
 
     write(skeleton[0][0], 0)
     frames = np.concatenate(columns, 1)
-    frames = np.concatenate([np.zeros_like(frames[:1]), frames])
+    if not rest:
+        frames = np.concatenate([np.zeros_like(frames[:1]), frames])
     lines += ["MOTION", f"Frames: {len(frames)}", f"Frame Time: {frame_time:.7f}"]
     lines += [" ".join(f"{value:.7f}" for value in frame) for frame in frames]
     return "\n".join(lines) + "\n"

@@ -1,3 +1,5 @@
+import zipfile
+
 import numpy as np
 import pytest
 import torch
@@ -135,6 +137,135 @@ def test_bad_files_are_named_and_counted_and_cost_the_others_nothing(write_amass
         "CMU/04/some_nan.npz": ["poses: NaN, or rotations that no joint has, in 5 of 30 frames, left out"]
     }
     assert recordings.frame[recordings.clip == 1].tolist() == [*range(4), *range(9, 30)]
+
+
+def test_a_field_that_is_a_python_object_is_named_and_labels_that_are_cost_nothing(write_amass, joints_of):
+    path, _ = write_amass(poses=np.array([{"a": 1}], object))
+    with pytest.raises(
+        ValueError, match=r"^poses: it holds object of shape \(1,\), expected numbers or text"
+    ):
+        AmassSource().read(path)
+    labels = np.array([["C7"], ["LFHD", "RFHD"]], object)
+    path, poses = write_amass("SMPL-X", latent_labels=labels, labels_obs=labels)
+    np.testing.assert_allclose(AmassSource(rate_hz=None).read(path)[0].poses[:, :66], poses[:, :66])
+
+
+def test_arrays_may_be_of_any_order_and_packing(write_amass, tmp_path):
+    path, poses = write_amass()
+    with np.load(path) as arrays:
+        fields = dict(arrays)
+    fields["poses"] = np.asfortranarray(fields["poses"].astype(">f4"))
+    np.savez_compressed(path, **fields)
+    np.testing.assert_allclose(
+        AmassSource(rate_hz=None).read(path)[0].poses[:, :66], poses[:, :66], atol=1e-6
+    )
+    with zipfile.ZipFile(path, "w", allowZip64=True) as archive:
+        for name, value in fields.items():
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as file:
+                np.lib.format.write_array(file, value, allow_pickle=False)
+    np.testing.assert_allclose(
+        AmassSource(rate_hz=None).read(path)[0].poses[:, :66], poses[:, :66], atol=1e-6
+    )
+
+
+@pytest.mark.parametrize("value", [np.nan, 21.0, -1e9])
+def test_shapes_that_no_one_has_are_refused(value, write_amass):
+    path, _ = write_amass(betas=np.array([0, value, *np.zeros(14)]))
+    write_amass(place="CMU/02/a_poses.npz", betas=np.array([*np.zeros(10), value]))  # the first ten count
+    recordings = AmassSource(path.parents[2]).recordings
+    assert recordings.subjects == ("CMU/02",)
+    assert "betas: NaN, or beyond 20 standard deviations" in recordings.skipped["CMU/01/01_01_poses.npz"]
+
+
+def test_files_that_python_2_wrote_are_read_in_silence(write_amass, recwarn):
+    path, poses = write_amass()
+    with zipfile.ZipFile(path) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    old = members["poses.npy"]
+    members["poses.npy"] = old[:128].replace(b"(24, 156), }  ", b"(24L, 156L), }") + old[128:]
+    assert members["poses.npy"] != old
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, content in members.items():
+            archive.writestr(name, content)
+    np.testing.assert_allclose(AmassSource(rate_hz=None).read(path)[0].poses[:, :66], poses[:, :66])
+    assert not recwarn.list
+
+
+def test_poses_may_come_in_two_parts(write_amass):
+    path, poses = write_amass("SMPL-X", poses=None)
+    parts = {"root_orient": poses[:, :3], "pose_body": poses[:, 3:66]}
+    path, poses = write_amass("SMPL-X", poses=None, **parts)
+    np.testing.assert_allclose(AmassSource(rate_hz=None).read(path)[0].poses[:, :66], poses[:, :66])
+    path, _ = write_amass("SMPL-X", poses=None, **parts | {"pose_body": poses[:, 3:65]})
+    with pytest.raises(
+        ValueError, match=r"^root_orient, pose_body: expected shapes \(T, 3\) and \(T, 63\), got"
+    ):
+        AmassSource().read(path)
+
+
+PLACES = {
+    "CMU/01/01_01_poses.npz": "CMU/01",
+    "CMU/02 b/02 ü_poses.npz": "CMU/02 b",
+    "ACCAD/Female1General_c3d/A1 - Stand_poses.npz": "ACCAD/Female1",
+    "ACCAD/Female1Walking_c3d/B1_poses.npz": "ACCAD/Female1",
+    "ACCAD/MartialArtsWalksTurns_c3d/E1_poses.npz": "ACCAD/Male2",
+    "ACCAD/s007/QkWalk1_poses.npz": "ACCAD/s007",
+    "DanceDB/20120805_VasoAristeidou/V1_poses.npz": "DanceDB/VasoAristeidou",
+    "DanceDB/20120807_VasoAristeidou/V2_poses.npz": "DanceDB/VasoAristeidou",
+}
+
+
+def test_a_person_has_one_name_at_whatever_level_a_folder_is_given(write_amass):
+    for place in PLACES:
+        path, _ = write_amass(place=f"SMPL_H_G/{place}")
+    write_amass(place="SMPLX_N/CMU/01/01_01_stageii.npz", release="SMPL-X")
+    release = path.parents[2]
+    for root, start in (
+        (release.parent, ""),
+        (release, ""),
+        (release / "CMU", "CMU/"),
+        (release / "ACCAD", "ACCAD/"),
+    ):
+        recordings = AmassSource(root).recordings
+        expected = {subject for subject in PLACES.values() if subject.startswith(start)}
+        assert set(recordings.subjects) == expected, root
+        assert recordings.skipped == {}
+    assert len(AmassSource(release.parent).recordings.clips) == len(PLACES) + 1
+
+
+def test_links_are_followed_once_and_leavings_passed_over(write_amass, tmp_path):
+    path, _ = write_amass()
+    root = tmp_path / "all"
+    root.mkdir()
+    (root / "CMU.tar.bz2").write_bytes(b"BZh9")
+    with pytest.raises(
+        FileNotFoundError, match=r"no \.npz file in .*all' or below; unpack the 1 archives there"
+    ):
+        AmassSource(root).check()
+    (root / "CMU").symlink_to(path.parents[1])
+    (path.parent / "again").symlink_to(root)
+    (path.parent / "._01_01_poses.npz").write_bytes(b"Mac OS X")
+    recordings = AmassSource(root).recordings
+    assert (recordings.subjects, recordings.skipped) == (("CMU/01",), {})
+
+
+def test_what_is_wrong_with_many_files_is_said_of_a_few_and_counted(write_amass, caplog, tmp_path):
+    for number in range(9):
+        path, _ = write_amass(place=f"CMU/{number}/a_poses.npz", gender=None, betas=None)
+
+    def source():
+        made = AmassSource(path.parents[2])
+        made.cache_dir = tmp_path / "cache"
+        return made
+
+    recordings = source().recordings
+    assert len(recordings.notes) == 9
+    note = "gender: missing, or a Python object; it is drawn"
+    assert caplog.text.count(f"a_poses.npz: {note}") == 3
+    assert f"9 of 9 files: {note}" in caplog.text
+    caplog.clear()
+    assert source().recordings.notes == recordings.notes
+    assert f"9 of 9 files: {note}" in caplog.text, "from the table that is kept, too"
 
 
 def test_a_folder_without_a_file_that_can_be_read_is_an_error(write_amass, tmp_path):

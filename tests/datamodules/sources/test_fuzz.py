@@ -3,14 +3,18 @@
 import io
 import logging
 import re
+import zipfile
 from collections import Counter
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+from datamodules.sources import SPLITS
 from datamodules.sources.amass import AmassSource
 from datamodules.sources.bvh import BvhSource
-from datamodules.sources.bvh.skeleton import _DIRECTORY, read_skeleton
+from datamodules.sources.bvh.skeleton import _DIRECTORY, axes_of, read_skeleton
+from datamodules.sources.mixed import MixedSource
 from datamodules.sources.npz import NpzSource
 from datamodules.sources.recordings import _checked
 from datamodules.sources.subjects import read_splits
@@ -21,8 +25,8 @@ JUNK = (
     b"!!python/object:os.system x", b"1_0", b"0x10", b"-", b",", "\u0661".encode(),
 )  # fmt: skip
 OURS = re.compile(
-    r"(it cannot be read|it holds no motion|poses|betas|gender|clip|subject|frame|joints?|rest_frame|HIERARCHY|MOTION|"
-    r"CHANNELS|OFFSET|data\.source\.(skeleton|splits))\b"
+    r"(it cannot be read|it holds no motion|root_orient|poses|betas|gender|clip|subject|frame|joints?|rest_frame|"
+    r"HIERARCHY|MOTION|CHANNELS|OFFSET|data\.source\.(skeleton|splits))\b"
 )
 """How our own errors begin: with the field, the place in the file, or the setting."""
 
@@ -64,6 +68,36 @@ def damaged_words(text, rng):
     return " ".join(words)
 
 
+def damaged_lines(text, rng):
+    """A text with some of its lines doubled, left out, moved, joined, or put where another was."""
+    lines = text.split("\n")
+    end = len(lines) if rng.random() < 0.3 else lines.index("MOTION") + 3
+    for _ in range(rng.integers(1, 4)):
+        at, other = (int(rng.integers(min(end, len(lines) - 1))) for _ in range(2))
+        kind = rng.integers(5)
+        if kind == 0:
+            lines.insert(other, lines[at])
+        elif kind == 1:
+            del lines[at]
+        elif kind == 2:
+            lines[at], lines[other] = lines[other], lines[at]
+        elif kind == 3:
+            lines[at : at + 2] = [" ".join(lines[at : at + 2])]
+        else:
+            words, others = lines[at].split(), lines[other].split()
+            lines[at] = " ".join(words[:1] + others[1:])
+    return "\n".join(lines)
+
+
+def packed(members):
+    """An archive of files by name, whole and with right checksums."""
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w") as archive:
+        for name, content in members.items():
+            archive.writestr(name, content)
+    return stream.getvalue()
+
+
 def odd_array(rng, value):
     """An array of another type, shape or content."""
     kind = rng.integers(9)
@@ -101,7 +135,16 @@ def damaged_npz(fields, rng):
     stream = io.BytesIO()
     np.savez(stream, **fields)
     content = stream.getvalue()
-    return content if rng.random() < 0.5 else damaged(content, rng)
+    if (choice := rng.random()) < 0.4:
+        return content
+    if choice < 0.6:  # most of these fail at a checksum
+        return damaged(content, rng)
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    name = rng.choice(list(members))
+    head = 128 if rng.random() < 0.7 else len(members[name])  # the header, which says type, order and shape
+    members[name] = damaged(members[name][:head], rng) + members[name][head:]
+    return packed(members)
 
 
 def error_of(read, path):
@@ -175,14 +218,53 @@ def test_damaged_npz_files_are_read_or_refused(source, some_poses, tmp_path):
 
 @pytest.mark.slow
 def test_damaged_bvh_files_are_read_or_refused(real_poses, make_bvh, tmp_path):
+    axes = {"hip": "z x y", "lThigh": "-z -x y", "rThigh": "-z -x y"}
+    rest = {name: axes_of(text) for name, text in axes.items()}
+    along_x = tmp_path / "x.yaml"
+    along_x.write_text(
+        (_DIRECTORY / "cmu_daz.yaml").read_text()
+        + "rest_axes: {pelvis: z x y, l_hip: -z -x y, r_hip: -z -x y}\n"
+    )
+    for skeleton, text in (
+        ("auto", make_bvh(real_poses[:6])),
+        (along_x, make_bvh(real_poses[:6], rest=rest)),
+    ):
+
+        def make(rng, text=text):
+            if (choice := rng.random()) < 0.3:
+                return damaged(text.encode(), rng)
+            changed = damaged_words(text, rng) if choice < 0.6 else damaged_lines(text, rng)
+            return changed.encode("utf-8", "replace")
+
+        source = BvhSource(skeleton=skeleton)
+        report(f"bvh, {Path(skeleton).stem}", outcomes(make, checked(source), tmp_path / "a.bvh"))
+
+
+@pytest.mark.slow
+def test_a_folder_of_damaged_files_gives_records_and_counts(some_poses, make_bvh, real_poses, tmp_path):
+    rng = np.random.default_rng(0)
     text = make_bvh(real_poses[:6])
-
-    def make(rng):
-        if rng.random() < 0.5:
-            return damaged(text.encode(), rng)
-        return damaged_words(text, rng).encode("utf-8", "replace")
-
-    report("bvh", outcomes(make, checked(BvhSource()), tmp_path / "a.bvh"))
+    fields = {"poses": np.zeros((6, 156)), "betas": np.zeros(16), "gender": np.array("female")}
+    number = 300
+    for place in range(number):
+        for folder, name, content in (
+            ("amass", f"CMU/{place}/a_poses.npz", damaged_npz(fields, rng)),
+            ("bvh", f"{place}/a.bvh", damaged_lines(text, rng).encode()),
+        ):
+            path = tmp_path / folder / name
+            path.parent.mkdir(parents=True)
+            path.write_bytes(content)
+    parts = {"amass": AmassSource(tmp_path / "amass"), "bvh": BvhSource(tmp_path / "bvh")}
+    mixed = MixedSource(parts, {"amass": 1, "bvh": 1})
+    mixed.check()
+    for name, source in parts.items():
+        recordings = source.recordings
+        assert len(recordings.skipped) + len(set(recordings.clips)) == number
+        assert all(OURS.match(why) for why in recordings.skipped.values())
+        print(f"{name}: {number} damaged files in a folder, {len(recordings.skipped)} left out")
+    for split in SPLITS:
+        records = mixed.records(split, 2000, 0)
+        assert all(np.isfinite(getattr(records, name)).all() for name in ("pose", "betas"))
 
 
 @pytest.mark.slow

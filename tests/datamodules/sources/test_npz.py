@@ -58,6 +58,9 @@ def test_files_of_a_folder_have_its_subfolders_as_subjects(some_poses, tmp_path)
     assert found.subjects == ("a", "a", "b", "c")
 
 
+SWUNG = np.tile(np.linspace(-1, 1, 72), (5, 1))
+
+
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
@@ -65,9 +68,10 @@ def test_files_of_a_folder_have_its_subfolders_as_subjects(some_poses, tmp_path)
         ({"poses": POSES, "clip": np.arange(5), "clips": ["a"]}, "clip: expected numbers of the 1 `clips`"),
         ({"poses": POSES, "subject": np.zeros((5, 2))}, "subject: expected one, or one for each of 5"),
         ({"poses": POSES, "betas": np.zeros((4, 10))}, r"betas: expected shape \(B,\), or \(T, B\) with T = 5"),
-        ({"poses": POSES, "betas": np.full(10, np.nan)}, "betas: NaN, or values that no shape has"),
+        ({"poses": POSES, "betas": np.full(10, np.nan)}, "betas: NaN, or beyond 20 standard deviations"),
         ({"poses": POSES, "frame": np.zeros(5)}, "frame: expected whole numbers"),
         ({"poses": POSES, "gender": "x"}, "gender: expected one of female, male, neutral, got 'x'"),
+        ({"poses": np.rad2deg(SWUNG)}, "rotations that no joint has in 5 of 5 frames; expected radians, not deg"),
         ({"poses": np.array(["a"])}, "poses: expected numbers, got <U1"),
         ({"poses": np.zeros((0, 72))}, "it holds no motion|poses: no frame"),
         ({"pose": POSES}, "poses: no such field in it"),
@@ -81,3 +85,10 @@ def test_a_wrong_field_is_named(fields, message, tmp_path):
 def test_an_unknown_axis_is_named():
     with pytest.raises(ValueError, match="up: expected one of y, z, got 'x'"):
         NpzSource("a.npz", up="x")
+
+
+def test_a_rate_that_cannot_be_kept_is_said(some_poses, tmp_path):
+    np.savez(tmp_path / "a.npz", poses=some_poses(6), clip=np.repeat(["a_1", "b_1"], 3))
+    assert NpzSource(tmp_path / "a.npz").recordings.notes == {}
+    recordings = NpzSource(tmp_path / "a.npz", rate_hz=10).recordings
+    assert recordings.notes == {"a.npz": ["frame_rate: missing, so all frames count"]}

@@ -321,6 +321,48 @@ def test_a_mixture_of_recorded_sources_keeps_headings(poses_file):
     assert parts["b"].cache_dir == Path("cache")
 
 
+def test_people_of_two_sources_in_different_splits_are_warned_of(some_poses, source, tmp_path, caplog):
+    for name in ("01", "02", "03"):
+        path = tmp_path / "AMASS/CMU" / name / "a_poses.npz"
+        path.parent.mkdir(parents=True)
+        np.savez(path, poses=some_poses(5))
+    names = np.repeat(["01", "2", "3"], 5)
+    np.savez(tmp_path / "plain.npz", poses=some_poses(15), subject=names)
+    for name, table in {
+        "one": "train: [CMU/01]\nval: [CMU/02]\ntest: [CMU/03]",
+        "two": "train: ['01']\nval: ['3']\ntest: ['2']",
+        "same": "train: ['01']\nval: ['2']\ntest: ['3']",
+    }.items():
+        (tmp_path / f"{name}.yaml").write_text(table)
+    one = AmassSource(tmp_path / "AMASS", splits=tmp_path / "one.yaml")
+    same = NpzSource(tmp_path / "plain.npz", splits=tmp_path / "same.yaml")
+    MixedSource({"amass": one, "npz": same}, {"amass": 1, "npz": 1}).check()
+    assert "splits of two sources" not in caplog.text
+    two = NpzSource(tmp_path / "plain.npz", splits=tmp_path / "two.yaml")
+    MixedSource({"amass": one, "npz": two}, {"amass": 1, "npz": 1}).check()
+    assert (
+        "splits of two sources: 2, such as 2 (npz: test, amass: val), 3 (amass: test, npz: val)"
+        in caplog.text
+    )
+    caplog.clear()
+    MixedSource({"amass": one, "embedded": source}, {"amass": 1, "embedded": 1}).check()
+    assert "1, such as 1 (embedded: test, amass: train)" in caplog.text, "clips 01_01 and 01_03"
+
+
+def test_what_a_source_of_a_mixture_lacks_is_named_by_its_own_setting():
+    mixed = MixedSource({"bvh": BvhSource()}, {"bvh": 1})
+    with pytest.raises(
+        ValueError, match=r"^data\.source\.sources\.bvh\.path: .* add data\.source\.sources\.bvh\.path"
+    ):
+        mixed.check()
+
+
+def test_names_may_say_the_subject(some_poses, tmp_path):
+    for name in ("walk1_subject1", "walk1_subject5", "run2_subject1", "01_02"):
+        np.savez(tmp_path / f"{name}.npz", poses=some_poses(5))
+    assert sorted(set(NpzSource(tmp_path).recordings.subjects)) == ["01", "subject1", "subject5"]
+
+
 @pytest.mark.parametrize("weights", [{"c": 1}, {"a": 0}, {}, {"a": -1}, {"a": float("inf")}])
 def test_weights_that_make_no_sense_are_named(weights):
     with pytest.raises(ValueError, match="weights: expected "):
