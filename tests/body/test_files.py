@@ -600,7 +600,7 @@ def damaged(content, rng):
     # The pickle's own words stand between the arrays' numbers, mostly at the two ends.
     ends = 3000
     for _ in range(rng.integers(1, 6)):
-        at = int(rng.integers(len(content)) if rng.random() < 0.3 else rng.integers(-ends, ends)) % len(content)
+        at = rng.integers(len(content)) if rng.random() < 0.3 else rng.integers(-ends, ends) % len(content)
         length = int(rng.integers(1, 9))
         kind = rng.integers(5)
         if kind < 2:
@@ -625,17 +625,17 @@ def test_thousands_of_damaged_bodies_are_read_or_refused(tmp_path):
     ]
     for path in whole:
         rng = np.random.default_rng(0)
-        content, found = path.read_bytes(), {"read": 0, "refused": 0}
+        content, num_read, messages = path.read_bytes(), 0, []
         for _ in range(2000):
             path.write_bytes(damaged(content, rng))
             try:
                 body = load_body_model(path)
             except ValueError as error:
-                assert str(path) in str(error)
-                found["refused"] += 1
+                messages.append(str(error))
             else:
                 assert all(np.isfinite(getattr(body, name)).all() for name in ("v_template", "weights"))
-                found["read"] += 1
-        print(path.name, found)
-        assert found["refused"] > 100
-        assert found["read"]  # few archives: their checksums tell
+                num_read += 1
+        print(f"{path.name}: {num_read} read, {len(messages)} refused")
+        assert all(str(path) in message for message in messages)
+        assert len(messages) > 100
+        assert num_read  # few archives: their checksums tell
