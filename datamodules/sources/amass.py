@@ -31,6 +31,7 @@ class AmassSource(RecordedSource):
 
     name = "amass"
     suffix = ".npz"
+    other_axes = "AMASS's own are z up; those that are y up reads data/source=npz"
     licence = (
         "AMASS, or files of its form, that the user brought; see the licences of AMASS and of its data sets"
     )

@@ -29,6 +29,7 @@ class NpzSource(RecordedSource):
 
     name = "npz"
     suffix = ".npz"
+    other_axes = "data.source.up=z reads those that are z up, up=y those that are y up"
     licence = "files of poses that the user brought; their licence is not known here"
 
     def __init__(self, path: str | Path | None = None, up: str = "y", **settings: Any) -> None:

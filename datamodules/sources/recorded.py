@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import logging
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
 from functools import cached_property
@@ -23,10 +24,13 @@ from datamodules.sources.shapes import Shapes, check_shapes, draw_shapes
 from datamodules.sources.subjects import Subjects, check_shares, read_splits, split_by_hash
 from ljn.body import GENDERS
 
+_LOG = logging.getLogger(__name__)
 _BLOCK = 4096  # records at once; their random numbers hang on it
-_READING = 2  # of the tables that are kept: changed where a file is read otherwise
+_READING = 3  # of the tables that are kept: changed where a file is read otherwise
 _ORDER, _SHAPES = range(2)
 SHAPES = ("recorded", "drawn")
+_UPRIGHT = 0.5  # of `Recordings.upright`: bodies of less lie, or stand on their heads
+_MANY_LYING = 0.2  # share of the motions; of motion capture, 1 to 5 %
 
 
 class RecordedSource(ABC):
@@ -54,6 +58,8 @@ class RecordedSource(ABC):
     version = 1
     licence: str
     suffix: str
+    other_axes = "Poses have to lead into a world that is z up"
+    """What to do about files with another vertical axis."""
     cache_dir: Path | None = None
 
     def __init__(
@@ -124,9 +130,16 @@ class RecordedSource(ABC):
         files = [file for file in find_motion_files(self.path, self.suffix) if self.is_motion(file)]
         if not files:
             raise FileNotFoundError(f"data.source.path: no {self.suffix} file of a motion in '{self.path}'")
-        return read_recordings(
+        recordings = read_recordings(
             self.path, files, self.read, self.reader_settings, self.cache_dir, self.subject_of
         )
+        lying = [name for name, upright in zip(recordings.clips, recordings.upright) if upright < _UPRIGHT]
+        if len(lying) > _MANY_LYING * len(recordings.clips):
+            _LOG.warning(
+                "in %d of %d motions bodies do not stand, as in %s: do these people lie, or have the files another "
+                "vertical axis? %s", len(lying), len(recordings.clips), lying[0], self.other_axes,
+            )  # fmt: skip
+        return recordings
 
     @cached_property
     def _subjects(self) -> Subjects:
@@ -170,9 +183,11 @@ class RecordedSource(ABC):
     def motion(self, split: str) -> dict[str, int]:
         """See `PoseSource.motion`."""
         rows = self.rows(split)
+        clips = np.unique(self.recordings.clip[rows])
         return {
             "subjects": len(self._subjects[split]),
-            "clips": len(np.unique(self.recordings.clip[rows])),
+            "clips": len(clips),
+            "lying_clips": sum(self.recordings.upright[clip] < _UPRIGHT for clip in clips),
             "frames": len(rows),
             "skipped_files": len(self.recordings.skipped),
         }

@@ -61,6 +61,8 @@ class Recordings:
         frame: `(N,)` int64.
         clips: The motions' names.
         subjects: The motions' subjects, as many.
+        upright: How much their bodies stand, as many: 1 upright, 0 lying, the mean of the vertical component of the
+            axis that leads from pelvis to head at rest.
         skipped: The files that could not be read, and why.
         notes: What was wrong with others and could be passed over.
         hash: Names the content.
@@ -73,6 +75,7 @@ class Recordings:
     frame: np.ndarray
     clips: tuple[str, ...]
     subjects: tuple[str, ...]
+    upright: tuple[float, ...]
     skipped: dict[str, str]
     notes: dict[str, list[str]]
     hash: str
@@ -158,22 +161,21 @@ def read_recordings(
     pose, betas, gender, clip, frame = (
         stored[name].numpy() for name in ("pose", "betas", "gender", "clip", "frame")
     )
-    clips, subjects = tuple(about["clips"]), tuple(about["subjects"])
-    skipped, notes = about["skipped"], about["notes"]
-    recordings = Recordings(pose, betas, gender, clip, frame, clips, subjects, skipped, notes, about["hash"])
+    clips, subjects, upright = (tuple(about[name]) for name in ("clips", "subjects", "upright"))
+    others = about["skipped"], about["notes"], about["hash"]
+    recordings = Recordings(pose, betas, gender, clip, frame, clips, subjects, upright, *others)
+    skipped, notes = recordings.skipped, recordings.notes
     _LOG.info(
         "%d of %d files read, %d motions of %d subjects, %d frames",
-        *(len(files) - len(recordings.skipped), len(files), len(recordings.clips)),
-        *(len(set(recordings.subjects)), len(recordings.pose)),
+        *(len(files) - len(skipped), len(files), len(clips)),
+        *(len(set(subjects)), len(pose)),
     )
     kinds = Counter(kind for said in notes.values() for kind in {_kind(note) for note in said})
     for kind, count in kinds.most_common():
         _LOG.warning("%d of %d files: %s", count, len(files), kind)
-    if recordings.skipped:
-        name, why = next(iter(recordings.skipped.items()))
-        _LOG.warning(
-            "%d of %d files left out; the first is %s: %s", len(recordings.skipped), len(files), name, why
-        )
+    if skipped:
+        name, why = next(iter(skipped.items()))
+        _LOG.warning("%d of %d files left out; the first is %s: %s", len(skipped), len(files), name, why)
     return recordings
 
 
@@ -189,6 +191,7 @@ def _gather(
     parts: list[tuple[np.ndarray, ...]] = []
     clips: list[str] = []
     subjects: list[str] = []
+    upright: list[float] = []
     skipped: dict[str, str] = {}
     notes: dict[str, list[str]] = {}
     kinds: Counter[str] = Counter()
@@ -207,6 +210,7 @@ def _gather(
             stem = place.removesuffix(file.suffix) if len(files) > 1 or not motion.name else ""
             clips.append("/".join(filter(None, (stem, motion.name))).replace("|", "_"))
             subjects.append(motion.subject or subject(file, root))
+            upright.append(_upright(columns[0][:, :3]))
             parts.append((*columns, np.full(len(columns[0]), len(clips) - 1)))
             for note in motion.notes:
                 notes.setdefault(place, []).append(note)
@@ -221,8 +225,24 @@ def _gather(
     pose, betas, gender, frame, clip = (np.concatenate(column) for column in zip(*parts))
     return {
         **{"pose": pose, "betas": betas, "gender": gender, "clip": clip, "frame": frame},
-        "about": {"clips": clips, "subjects": subjects, "skipped": skipped, "notes": notes},
+        "about": {
+            "clips": clips,
+            "subjects": subjects,
+            "upright": upright,
+            "skipped": skipped,
+            "notes": notes,
+        },
     }
+
+
+def _upright(rotvec: np.ndarray) -> float:
+    """See `Recordings.upright`; of the pelvis' rotations `(T, 3)` into the body world, which is z up."""
+    x, y, z = rotvec.T.astype(np.float64)
+    angle = np.sqrt(x**2 + y**2 + z**2)
+    # Row z, column y of Rodrigues' formula.
+    return round(
+        float((y * z * 0.5 * np.sinc(angle / (2 * np.pi)) ** 2 + x * np.sinc(angle / np.pi)).mean()), 3
+    )
 
 
 def _checked(motion: Motion) -> tuple[Motion, tuple[np.ndarray, ...]]:

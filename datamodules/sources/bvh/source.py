@@ -27,6 +27,7 @@ class BvhSource(RecordedSource):
 
     name = "bvh"
     suffix = ".bvh"
+    other_axes = "in a table of the skeleton, rest_frame says in which frame a person stands"
     licence = "BVH files that the user brought; their licence is not known here"
 
     def __init__(self, path: str | Path | None = None, skeleton: str | Path = AUTO, **settings: Any) -> None:

@@ -1,3 +1,5 @@
+import re
+
 import numpy as np
 import pytest
 import torch
@@ -25,6 +27,19 @@ def test_a_round_trip_keeps_the_joints(some_poses, joints_of, tmp_path):
     assert found.subjects == ("x", "y")
     as_is = recordings_of(tmp_path / "a.npz", {"up": "z"}, poses=world)
     np.testing.assert_allclose(as_is.pose, world, atol=1e-5)
+
+
+def test_a_file_read_with_the_wrong_vertical_axis_is_doubted(tmp_path, caplog):
+    subjects = np.array(list("abcde"))
+    np.savez(
+        tmp_path / "a.npz", poses=smpl_pose_to_body_world(torch.from_numpy(POSES)).numpy(), subject=subjects
+    )
+    NpzSource(tmp_path / "a.npz", up="z").check()
+    assert not caplog.messages
+    source = NpzSource(tmp_path / "a.npz")
+    source.check()
+    assert re.search(r"in 5 of 5 motions bodies do not stand, as in .*: .*data\.source\.up=z", caplog.text)
+    assert source.motion("test")["lying_clips"] == 1
 
 
 @pytest.mark.parametrize("shape", [(6, 24, 3), (6, 156), (6, 165), (6, 66), (6, 55, 3)])
