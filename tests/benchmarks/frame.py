@@ -1,8 +1,9 @@
-"""What a frame costs with the weights that ship, by part: python -m tests.benchmarks.frame
+"""What a frame costs with the weights that ship, by part: python -m tests.benchmarks.frame [small | base]
 
 One thread, processor time, milliseconds; means over calls.
 """
 
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -30,7 +31,7 @@ def main() -> None:
     """Print the parts."""
     torch.set_num_threads(1)
     start = time.process_time()
-    pipeline = Pipeline.from_pretrained()
+    pipeline = Pipeline.from_pretrained(*sys.argv[1:2])
     print(f"loading, once    {1000 * (time.process_time() - start):8.0f}")
     folder = Path(FRAMES) / "kinect_v2"
     depth, camera = read_depth(folder / "depth" / "walking.png"), read_camera(folder / "camera.yaml")
