@@ -26,7 +26,10 @@ def read_clips(path: Path) -> Clips:
         ValueError: It is damaged, or holds something else.
     """
     if not path.is_file():
-        raise FileNotFoundError(f"poses: no file {path}; leave `path` out to use the embedded clips")
+        raise FileNotFoundError(
+            f"poses: no file {path}; leave `path` out to use the embedded clips, or name the kind of your data "
+            "(data/source=amass, bvh, npz, surreal)"
+        )
     try:
         arrays = read_arrays(path, ("poses", "clip"))
         poses, clip = arrays["poses"].astype(np.float32), arrays["clip"].astype(str)

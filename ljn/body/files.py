@@ -208,10 +208,12 @@ def load_body_models(path: str | Path | None, genders: Sequence[str]) -> tuple[B
         named = (_named_for(gender, Path(path) / folder) for folder in _FOLDERS)
         files = next((each for each in named if each), [])
         if not files:
+            there = ", ".join(sorted(file.name for file in Path(path).iterdir())[:6]) or "nothing"
             raise FileNotFoundError(
                 f"path (body.path): no body of gender {gender} in {path}; expected SMPL_{gender.upper()}.pkl, "
                 f"{gender}.npz or the official name (basicmodel_..._lbs_10_207_0_v1.1.0.pkl). Put it there, or leave "
-                f"the gender out (body.genders, body.predicted). {_OFFICIAL}"
+                f"the gender out (body.genders, body.predicted). There is: {there}. Files of SMPL+H and SMPL-X do not "
+                f"serve, nor do archives that are not unpacked. {_OFFICIAL}"
             )
         if len(files) > 1:
             names = ", ".join(file.name for file in files)

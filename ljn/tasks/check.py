@@ -34,5 +34,5 @@ def check(cfg: DictConfig) -> dict[str, float]:
     if wrong:
         raise ValueError(f"data: {wrong[-1].text}")
     if not largest:
-        print("All files are there and whole; there is nothing that they could be held against.")
+        print("What is not named above is whole; there is nothing that it could be held against.")
     return largest

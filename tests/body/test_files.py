@@ -510,7 +510,9 @@ def test_bad_files_of_bodies_are_named(tmp_path):
     with pytest.raises(FileNotFoundError, match=r"missing\.npz"):
         load_body_models(tmp_path / "missing.npz", ["female", "male"])
     (tmp_path / "male.npz").write_bytes(file.read_bytes())
-    with pytest.raises(FileNotFoundError, match=r"no body of gender female .*SMPL_FEMALE\.pkl"):
+    with pytest.raises(
+        FileNotFoundError, match=r"no body of gender female .*SMPL_FEMALE\.pkl.*There is: male\.npz"
+    ):
         load_body_models(tmp_path, ["male", "female"])
     (tmp_path / "SMPL_MALE.npz").write_bytes(file.read_bytes())
     with pytest.raises(ValueError, match=r"several bodies of gender male .*SMPL_MALE\.npz, male\.npz"):

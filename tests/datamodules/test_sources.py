@@ -303,6 +303,10 @@ def test_an_unknown_split_and_missing_files_are_named(source, tmp_path):
         source.records("dev", 1, 0)
     with pytest.raises(FileNotFoundError, match=r"poses: no file .*none\.npz; leave `path` out"):
         EmbeddedSource(path=tmp_path / "none.npz").check()
+    with pytest.raises(
+        FileNotFoundError, match=r"poses: no file .*name the kind of your data \(data/source=amass"
+    ):
+        EmbeddedSource(path=tmp_path).check()
     with pytest.raises(FileNotFoundError, match=r"poses: no split file .*none\.json"):
         EmbeddedSource(split_path=tmp_path / "none.json").check()
 

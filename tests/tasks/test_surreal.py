@@ -67,7 +67,7 @@ def test_what_is_wrong_is_an_error_after_all_else_is_said(smoke_config, tmp_path
 
 def test_a_check_of_poses_without_anything_to_compare_says_so(smoke_config, tmp_path, capsys):
     assert check(smoke_config(tmp_path, "task=check")) == {}
-    assert "All files are there and whole" in capsys.readouterr().out
+    assert "What is not named above is whole" in capsys.readouterr().out
 
 
 def test_the_index_lies_in_the_data_modules_cache(smoke_config, tmp_path, tree):
