@@ -1,4 +1,4 @@
-"""What a frame costs with the weights that ship, by part: python -m tests.benchmarks.frame [small | base]
+"""What a frame costs with the weights that ship, by part: python -m tests.benchmarks.frame [WEIGHTS]
 
 One thread, processor time, milliseconds; means over calls.
 """
