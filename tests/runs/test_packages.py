@@ -268,6 +268,13 @@ def test_what_ships_loads(name):
     assert packages.read_about((SHIPPED / f"{name}.safetensors").read_bytes(), name)["name"] == name
 
 
+def test_the_larger_weights_beside_their_page_load():
+    path = Path(ljn.building.__file__).parents[1] / "docs" / "models" / "base.safetensors"
+    pipeline = Pipeline.from_pretrained(path)
+    assert pipeline.detector.recipe is not None
+    assert pipeline.regressor is not None
+
+
 def test_what_ships_is_in_the_index_and_small():
     files = {path.stem: path.stat().st_size for path in SHIPPED.glob("*.safetensors")}
     assert set(files) == set(INDEX)
