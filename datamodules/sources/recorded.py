@@ -30,7 +30,7 @@ _READING = 3  # of the tables that are kept: changed where a file is read otherw
 _ORDER, _SHAPES = range(2)
 SHAPES = ("recorded", "drawn")
 _UPRIGHT = 0.5  # of `Recordings.upright`: bodies of less lie, or stand on their heads
-_MANY_LYING = 0.2  # share of the motions; of motion capture, 1 to 5 %
+_MANY_LYING = 0.2  # share of the motions; of 93 of CMU none
 
 
 class RecordedSource(ABC):
